@@ -1,0 +1,1 @@
+"""Collaborative visual localization for drones, as a MAVLink companion service."""

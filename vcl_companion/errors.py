@@ -1,0 +1,21 @@
+"""The exceptions that leave a module on purpose; everything else is a bug."""
+
+
+class VclError(Exception):
+    """A failure whose message is one line for a person: what, where, what to do."""
+
+
+class ConfigError(VclError):
+    """A configuration file or option cannot be used as it stands."""
+
+
+class RecordingError(VclError):
+    """A recording on disk is broken; the message names the file and the row."""
+
+
+class WireError(VclError):
+    """Bytes from a peer are not what they claim to be; never raised past the border."""
+
+
+class DeviceError(VclError):
+    """A camera, serial port or socket cannot be used."""

@@ -1,0 +1,1 @@
+"""What a pose and a camera are; numpy only."""

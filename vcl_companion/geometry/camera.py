@@ -1,0 +1,152 @@
+"""A calibrated camera: where a point appears, and which ray a pixel looks along.
+
+Pixel (0, 0) is the centre of the top-left pixel. Distortion models and their
+coefficient order are OpenCV's and Kalibr's: ``radial-tangential`` (k1 k2 p1 p2
+[k3]) and ``equidistant`` (k1 k2 k3 k4, Kannala-Brandt).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from vcl_companion.geometry.rotation import Array
+
+DistortionModel = Literal["none", "radial-tangential", "equidistant"]
+
+_N_COEFFICIENTS = {"none": (0,), "radial-tangential": (4, 5), "equidistant": (4,)}
+_MIN_DEPTH_M = 1e-6
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of one camera.
+
+    Attributes:
+        width_px, height_px: image size.
+        fx_px, fy_px: focal lengths.
+        cx_px, cy_px: principal point, pixel centres at integers.
+        distortion_model: see the module.
+        distortion: its coefficients.
+    """
+
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion_model: DistortionModel = "none"
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
+        if not np.all(np.isfinite(numbers)):
+            raise ValueError(f"camera: intrinsics must be finite, got {numbers}")
+        if min(self.width_px, self.height_px) < 1 or min(self.fx_px, self.fy_px) <= 0:
+            raise ValueError("camera: image size and focal lengths must be positive")
+        expected = _N_COEFFICIENTS.get(self.distortion_model)
+        if expected is None:
+            known = ", ".join(_N_COEFFICIENTS)
+            raise ValueError(
+                f"camera: unknown distortion model {self.distortion_model!r} ({known})"
+            )
+        if len(self.distortion) not in expected:
+            raise ValueError(
+                f"camera: {self.distortion_model} takes {' or '.join(map(str, expected))} "
+                f"coefficients, got {len(self.distortion)}"
+            )
+
+    @property
+    def focal_px(self) -> float:
+        """Mean focal length, px per unit of the ideal image plane."""
+        return 0.5 * (self.fx_px + self.fy_px)
+
+    def project(self, points_cam: Array) -> Array:
+        """Return (N, 2) pixels of (N, 3) points in the camera frame, m; NaN when behind it."""
+        z = points_cam[:, 2]
+        front = z > _MIN_DEPTH_M
+        ideal = points_cam[:, :2] / np.where(front, z, np.nan)[:, None]
+        return self.pixels_from_ideal(ideal)
+
+    def pixels_from_ideal(self, ideal: Array) -> Array:
+        """Return (N, 2) pixels of (N, 2) ideal image coordinates x/z, y/z."""
+        return self._distorted(ideal) * (self.fx_px, self.fy_px) + (self.cx_px, self.cy_px)
+
+    def ideal_from_pixels(self, pixels: Array) -> Array:
+        """Return (N, 2) ideal image coordinates x/z, y/z of (N, 2) pixels (distortion removed).
+
+        Newton's method on the distortion; a row is NaN where it does not
+        converge (a pixel the model cannot have produced).
+        """
+        distorted = (np.asarray(pixels, dtype=np.float64) - (self.cx_px, self.cy_px)) / (
+            self.fx_px,
+            self.fy_px,
+        )
+        if self.distortion_model == "equidistant":
+            return self._ideal_from_equidistant(distorted)
+        if not any(self.distortion):
+            return np.asarray(distorted)
+        ideal = distorted.copy()
+        step = 1e-6
+        for _ in range(20):
+            error = self._distorted(ideal) - distorted
+            if error.size == 0 or np.nanmax(np.abs(error)) < 1e-12:
+                break
+            dx, dy = (
+                (self._distorted(ideal + shift) - self._distorted(ideal - shift)) / (2 * step)
+                for shift in (np.array([step, 0.0]), np.array([0.0, step]))
+            )
+            determinant = dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]
+            ideal = ideal - np.stack(
+                [
+                    (dy[:, 1] * error[:, 0] - dy[:, 0] * error[:, 1]) / determinant,
+                    (dx[:, 0] * error[:, 1] - dx[:, 1] * error[:, 0]) / determinant,
+                ],
+                axis=1,
+            )
+        bad = ~(np.abs(self._distorted(ideal) - distorted).max(axis=1) < 1e-8)
+        ideal[bad] = np.nan
+        return ideal
+
+    def _distorted(self, ideal: Array) -> Array:
+        """Return (N, 2) distorted normalised coordinates of (N, 2) ideal ones."""
+        if self.distortion_model == "none":
+            return ideal
+        x, y = ideal[:, 0], ideal[:, 1]
+        r2 = x * x + y * y
+        if self.distortion_model == "radial-tangential":
+            k1, k2, p1, p2, k3 = (*self.distortion, 0.0)[:5]
+            radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            return np.stack(
+                [
+                    x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+                    y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+                ],
+                axis=1,
+            )
+        r = np.sqrt(r2)
+        theta = np.arctan(r)
+        k1, k2, k3, k4 = self.distortion
+        t2 = theta * theta
+        theta_d = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        scale = np.where(r > 1e-9, theta_d / np.maximum(r, 1e-9), 1.0)
+        return np.asarray(ideal * scale[:, None])
+
+    def _ideal_from_equidistant(self, distorted: Array) -> Array:
+        """Invert Kannala-Brandt by Newton's method on the angle; NaN at 90 degrees and beyond."""
+        k1, k2, k3, k4 = self.distortion
+        theta_d = np.hypot(distorted[:, 0], distorted[:, 1])
+        theta = np.minimum(theta_d, np.pi / 2)
+        for _ in range(20):
+            t2 = theta * theta
+            value = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+            slope = 1.0 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+            theta = theta - (value - theta_d) / slope
+        t2 = theta * theta
+        value = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        ok = (np.abs(value - theta_d) < 1e-9) & (theta >= 0.0) & (theta < np.pi / 2 - 1e-3)
+        scale = np.where(theta_d > 1e-9, np.tan(theta) / np.maximum(theta_d, 1e-9), 1.0)
+        return np.asarray(np.where(ok, scale, np.nan)[:, None] * distorted)
