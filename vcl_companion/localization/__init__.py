@@ -1,0 +1,1 @@
+"""Where a drone is: Algorithm 1 of the paper."""

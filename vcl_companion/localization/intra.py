@@ -1,0 +1,345 @@
+"""Where one drone is, from one image and the map (intra-MAV localization, IV-D, IV-F)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array, euler_from_matrix
+from vcl_companion.localization.map_index import MapIndex
+from vcl_companion.vision.features import Detector, Features
+from vcl_companion.vision.matching import MatchOptions, match_guided, match_to_entries
+from vcl_companion.vision.resection import (
+    NotFound,
+    Resection,
+    ResectionOptions,
+    Sightings,
+    refine,
+    search,
+)
+
+_SURE_PX = 8.0
+
+
+@dataclass(frozen=True)
+class LocalizationOptions:
+    """When a pose is found, and when it is believed.
+
+    Attributes:
+        detector: features to look for; must be among those the maps are built with.
+        min_inliers: landmarks that must agree on a pose.
+        threshold_px: reprojection error of an inlier in the search.
+        guided_radius_px: largest uncertainty of a prediction that still guides the matching.
+        noise_floor_px: pixel noise is never taken for smaller than this, 1 sigma.
+        bias_px_per_deg: misplacement of a feature per degree that the landmark is
+            seen from another side than in its keyframe, 1 sigma.
+        bias_px_per_octave: the same per doubling or halving of its distance.
+        max_sigma_m: a pose less certain than this in any direction is refused.
+        max_tilt_deg: roll and pitch may disagree with the autopilot's by this much.
+        max_heading_deg: heading may disagree with the autopilot's by this much.
+    """
+
+    detector: Detector = "akaze"
+    min_inliers: int = 15
+    threshold_px: float = 4.0
+    guided_radius_px: float = 40.0
+    noise_floor_px: float = 0.5
+    bias_px_per_deg: float = 0.03
+    bias_px_per_octave: float = 1.5
+    max_sigma_m: float = 1.0
+    max_tilt_deg: float = 6.0
+    max_heading_deg: float = 25.0
+
+    def __post_init__(self) -> None:
+        if self.min_inliers < 6:
+            raise ValueError(f"min_inliers must be at least 6, got {self.min_inliers}")
+        for name in (
+            "threshold_px",
+            "guided_radius_px",
+            "noise_floor_px",
+            "max_sigma_m",
+            "max_tilt_deg",
+            "max_heading_deg",
+            "bias_px_per_deg",
+            "bias_px_per_octave",
+        ):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Where the drone is expected: world_from_body and its (6, 6) local covariance."""
+
+    world_from_body: Pose
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Localized:
+    """A pose from one image.
+
+    Attributes:
+        world_from_body: the pose.
+        noise_covariance: (6, 6) local, from this image's pixel noise; new in every frame.
+        own_map_covariance: (6, 6) local, from the used landmarks' own errors and
+            from how differently they look from here.
+        map_lever: (6, 6V) local pose error per keyframe error of the map.
+        keyframe_covariance: (6V, 6V) of those.
+        n_matched: landmarks matched.
+        n_inliers: of these, how many agree.
+        guided: whether the prediction led the matching.
+        rms_px: of the inliers.
+    """
+
+    world_from_body: Pose
+    noise_covariance: Array
+    own_map_covariance: Array
+    map_lever: Array
+    keyframe_covariance: Array
+    n_matched: int
+    n_inliers: int
+    guided: bool
+    rms_px: float
+
+    def covariance(self) -> Array:
+        """Return (6, 6) the whole covariance of this pose alone, local."""
+        shared = self.map_lever @ self.keyframe_covariance @ self.map_lever.T
+        return np.asarray(self.noise_covariance + self.own_map_covariance + shared)
+
+
+@dataclass(frozen=True)
+class NotLocalized:
+    """No pose from this image, and why."""
+
+    reason: str
+    n_matched: int = 0
+    n_inliers: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Matched:
+    """One attempt: the matches it made, and what came of them."""
+
+    landmarks: NDArray[np.intp]
+    sightings: Sightings
+    result: Resection | NotFound
+
+
+def localize_intra(
+    features: Features,
+    camera: Camera,
+    body_from_cam: Pose,
+    index: MapIndex,
+    prior: Prior | None,
+    ned_from_body: Array | None,
+    options: LocalizationOptions,
+) -> Localized | NotLocalized:
+    """Find the drone's pose in the map.
+
+    A good prediction guides the matching; without one, or where it misleads,
+    the whole map is searched. A pose found is used once more to match what the
+    first round missed.
+
+    Args:
+        features: of the image.
+        camera: its intrinsics.
+        body_from_cam: its mounting.
+        index: the current map.
+        prior: where the drone is expected, or None.
+        ned_from_body: (3, 3) attitude by the autopilot at that instant, or None.
+        options: thresholds.
+
+    Returns:
+        The pose with its covariance in two parts, or why there is none.
+    """
+    scene = _Matcher(features, camera, body_from_cam, index, options)
+    attempt = None
+    guided = False
+    if prior is not None:
+        radius_px = scene.radius_px(prior)
+        if radius_px <= options.guided_radius_px:
+            attempt = scene.guided(prior.world_from_body, max(radius_px, _SURE_PX))
+            guided = isinstance(attempt.result, Resection)
+    if attempt is None or not guided:
+        attempt = scene.whole_map()
+    if isinstance(attempt.result, Resection):
+        again = scene.guided(attempt.result.world_from_body, _SURE_PX)
+        if (
+            isinstance(again.result, Resection)
+            and again.result.inliers.sum() >= attempt.result.inliers.sum()
+        ):
+            attempt = again
+    return scene.judged(attempt, guided, ned_from_body)
+
+
+@dataclass(frozen=True, eq=False)
+class _Matcher:
+    """One image against one map."""
+
+    features: Features
+    camera: Camera
+    body_from_cam: Pose
+    index: MapIndex
+    options: LocalizationOptions
+
+    def radius_px(self, prior: Prior) -> float:
+        """Return 3 sigma of where landmarks will appear, px, for the nearest quarter of them."""
+        points_cam = (
+            (prior.world_from_body @ self.body_from_cam)
+            .inverse()
+            .apply(self.index.landmark_map.points_world)
+        )
+        z = points_cam[points_cam[:, 2] > 0.1, 2]
+        if len(z) == 0:
+            return float("inf")
+        depth = float(np.quantile(z, 0.25))
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1]))
+        sigma_rad = float(np.sqrt(np.linalg.eigvalsh(prior.covariance[3:, 3:])[-1]))
+        return 3.0 * self.camera.focal_px * float(np.hypot(sigma_m / depth, sigma_rad))
+
+    def guided(self, world_from_body: Pose, radius_px: float) -> _Matched:
+        """Match near where the pose puts each landmark, then refine from that pose."""
+        cam_from_world = (world_from_body @ self.body_from_cam).inverse()
+        predicted = self.camera.project(cam_from_world.apply(self.index.landmark_map.points_world))
+        margin = radius_px
+        with np.errstate(invalid="ignore"):
+            outside = (
+                (predicted < -margin).any(axis=1)
+                | (predicted[:, 0] > self.camera.width_px + margin)
+                | (predicted[:, 1] > self.camera.height_px + margin)
+            )
+        predicted[outside] = np.nan
+        found, landmarks = match_guided(
+            self.features,
+            self.index.entries,
+            self.index.owner,
+            predicted,
+            radius_px,
+            MatchOptions(),
+        )
+        sightings = self._sightings(found, landmarks, world_from_body)
+        start: Pose | NotFound = world_from_body
+        if radius_px > _SURE_PX:
+            start = search(sightings, self._resection_options())
+        return self._refined(start, landmarks, sightings)
+
+    def whole_map(self) -> _Matched:
+        """Match against every landmark, then search the pose among the matches."""
+        found, landmarks = match_to_entries(
+            self.features, self.index.entries, self.index.owner, MatchOptions()
+        )
+        sightings = self._sightings(found, landmarks, None)
+        return self._refined(search(sightings, self._resection_options()), landmarks, sightings)
+
+    def judged(
+        self, attempt: _Matched, guided: bool, ned_from_body: Array | None
+    ) -> Localized | NotLocalized:
+        """Believe the pose only when it is certain enough and upright enough."""
+        result = attempt.result
+        n_matched = len(attempt.landmarks)
+        if isinstance(result, NotFound):
+            return NotLocalized(result.reason, n_matched)
+        n_inliers = int(result.inliers.sum())
+        fix = Localized(
+            result.world_from_body,
+            result.noise_covariance,
+            *self._map_error(result, attempt.landmarks[result.inliers]),
+            self.index.uncertainty.keyframe_covariance,
+            n_matched,
+            n_inliers,
+            guided,
+            result.rms_px,
+        )
+        sigma = float(np.sqrt(np.diag(fix.covariance())[:3].max()))
+        if not sigma <= self.options.max_sigma_m:
+            return NotLocalized(
+                f"too uncertain: {sigma:.1f} m, {self.options.max_sigma_m:.1f} m allowed",
+                n_matched,
+                n_inliers,
+            )
+        if ned_from_body is not None:
+            reason = self._disagreement(result.world_from_body.rotation, ned_from_body)
+            if reason:
+                return NotLocalized(reason, n_matched, n_inliers)
+        return fix
+
+    def _disagreement(self, world_from_body: Array, ned_from_body: Array) -> str:
+        """Say how a pose contradicts the autopilot's attitude; empty when it does not."""
+        tilt = np.rad2deg(np.arccos(np.clip(world_from_body[2] @ ned_from_body[2], -1.0, 1.0)))
+        if tilt > self.options.max_tilt_deg:
+            return f"disagrees with the autopilot's roll and pitch by {tilt:.0f} degrees"
+        _, _, yaw = euler_from_matrix(world_from_body @ ned_from_body.T)
+        heading = abs(np.rad2deg(yaw))
+        if heading > self.options.max_heading_deg:
+            return f"disagrees with the autopilot's heading by {heading:.0f} degrees"
+        return ""
+
+    def _map_error(self, result: Resection, landmarks: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Return the pose's (6, 6) covariance by the landmarks' own errors, and its map lever."""
+        uncertainty = self.index.uncertainty
+        by_landmark = -result.gain @ result.jacobian_points
+        own = np.einsum(
+            "mij,mjk,mlk->il", by_landmark, uncertainty.landmark_covariance[landmarks], by_landmark
+        )
+        lever = np.einsum("mij,mjk->ik", by_landmark, uncertainty.landmark_lever[landmarks])
+        own += result.bias_covariance
+        return np.asarray(0.5 * (own + own.T)), np.asarray(lever)
+
+    def _sightings(
+        self,
+        found: NDArray[np.intp],
+        landmarks: NDArray[np.intp],
+        world_from_body: Pose | None,
+    ) -> Sightings:
+        bias_px = np.zeros(len(landmarks))
+        if world_from_body is not None:
+            bias_px = self._bias_px(landmarks, world_from_body)
+        return Sightings(
+            self.camera.ideal_from_pixels(self.features.pixels[found]),
+            self.index.landmark_map.points_world[landmarks],
+            self.index.landmark_covariances[landmarks],
+            self.camera.focal_px,
+            self.body_from_cam,
+            max(self.options.noise_floor_px, self.index.landmark_map.pixel_noise_px),
+            bias_px,
+        )
+
+    def _bias_px(self, landmarks: NDArray[np.intp], world_from_body: Pose) -> Array:
+        """Return (M,) how far a detector may misplace landmarks that look different from here.
+
+        By how much, against the keyframe that saw the landmark most alike, the
+        viewing direction and the distance have changed.
+        """
+        points = self.index.landmark_map.points_world[landmarks]
+        seen = self.index.landmark_map.seen[landmarks]
+        ray = points - (world_from_body @ self.body_from_cam).translation
+        distance = np.linalg.norm(ray, axis=1)
+        least = np.full(len(landmarks), np.inf)
+        for i, keyframe in enumerate(self.index.landmark_map.keyframes):
+            origin = (keyframe.world_from_body @ keyframe.body_from_cam).translation
+            then = points - origin
+            distance_then = np.linalg.norm(then, axis=1)
+            cosine = np.einsum("mi,mi->m", ray, then) / np.maximum(distance * distance_then, 1e-9)
+            angle_deg = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
+            octaves = np.abs(np.log2(np.maximum(distance, 1e-3) / np.maximum(distance_then, 1e-3)))
+            bias = np.hypot(
+                self.options.bias_px_per_deg * angle_deg, self.options.bias_px_per_octave * octaves
+            )
+            least = np.where(seen[:, i], np.minimum(least, bias), least)
+        return least
+
+    def _resection_options(self) -> ResectionOptions:
+        return ResectionOptions(self.options.threshold_px, self.options.min_inliers)
+
+    def _refined(
+        self, start: Pose | NotFound, landmarks: NDArray[np.intp], sightings: Sightings
+    ) -> _Matched:
+        if isinstance(start, NotFound):
+            return _Matched(landmarks, sightings, start)
+        result = refine(start, sightings, self._resection_options())
+        return _Matched(landmarks, sightings, result)

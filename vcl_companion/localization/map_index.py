@@ -1,0 +1,75 @@
+"""A map made ready to be recognised: descriptors and covariance, derived once per revision."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.mapping.drone_view import decode_image
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
+from vcl_companion.vision.features import Detector, FeatureOptions, Features, detect
+
+# Landmarks lie where the detector put them, up to the rounding of the wire format.
+_SAME_PX = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class MapIndex:
+    """What localization needs of a map.
+
+    Attributes:
+        landmark_map: the map.
+        uncertainty: its joint covariance.
+        landmark_covariances: (N, 3, 3) marginals, m^2.
+        entries: M descriptors, one for each keyframe that a landmark was recognised in.
+        owner: (M,) landmark of each entry.
+        detector: what made the descriptors.
+    """
+
+    landmark_map: LandmarkMap
+    uncertainty: MapUncertainty
+    landmark_covariances: Array
+    entries: Features
+    owner: NDArray[np.intp]
+    detector: Detector
+
+
+def index_map(landmark_map: LandmarkMap, detector: Detector, options: FeatureOptions) -> MapIndex:
+    """Derive descriptors from the keyframe images, and the covariance from the geometry.
+
+    Args:
+        landmark_map: any revision.
+        detector: the localization's own; landmarks of other detectors serve
+            the geometry only.
+        options: as used when the map was built.
+
+    Raises:
+        ValueError: an image cannot be decoded, or the map is not determined.
+    """
+    descriptors, pixels, owners = [], [], []
+    for i, keyframe in enumerate(landmark_map.keyframes):
+        features = detect(decode_image(keyframe.image_bytes, keyframe.camera), detector, options)
+        seen = np.flatnonzero(landmark_map.seen[:, i])
+        if len(features) == 0 or len(seen) == 0:
+            continue
+        distance, nearest = cKDTree(features.pixels).query(landmark_map.observed_px[seen, i])
+        nearest, found = np.atleast_1d(nearest), distance < _SAME_PX
+        descriptors.append(features.descriptors[nearest[found]])
+        pixels.append(features.pixels[nearest[found]])
+        owners.append(seen[found])
+    if not owners or sum(map(len, owners)) == 0:
+        raise ValueError(f"the map has no landmark that {detector} finds again in its keyframes")
+    uncertainty = map_uncertainty(landmark_map)
+    return MapIndex(
+        landmark_map,
+        uncertainty,
+        uncertainty.marginal(),
+        Features(np.concatenate(pixels), np.concatenate(descriptors)),
+        np.concatenate(owners).astype(np.intp),
+        detector,
+    )

@@ -1,0 +1,280 @@
+"""The Kalman filter of eqs. 5 to 7, on SO(3), with the map's error considered.
+
+What is estimated, besides position and velocity, is the rotation between the
+map's world and the autopilot's north-east-down: the autopilot's attitude is
+good from frame to frame and wrong by a slowly changing offset. The map's error
+is common to all frames and must not be averaged away: the keyframes' errors
+are *considered* (Schmidt 1966), that is, their correlation with the state is
+kept, while they themselves are not estimated.
+
+Error state: position (world), offset rotation (world), velocity (world), the
+attitude sample's own error (body, new in every frame), keyframe errors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array, exp_so3, log_so3
+from vcl_companion.localization.intra import Localized, NotLocalized, Prior
+
+_P, _B, _V, _W = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+_N_OWN = 12
+# 99.99 % of chi^2 with 6 and with 3 degrees of freedom: beyond, it is not noise.
+_GATE_POSE, _GATE_ROTATION = 27.9, 21.1
+_FORGOTTEN_M = 1e3
+_MAX_COAST_S = 60.0
+
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """How a drone moves, and how good its autopilot's attitude is.
+
+    Attributes:
+        acceleration_m_s2: unknown acceleration, 1 sigma.
+        speed_m_s: unknown speed at the start and after a jump, 1 sigma per axis.
+        attitude_sigma_deg: noise of one attitude sample, 1 sigma.
+        attitude_drift_deg_s: change of the attitude's offset in a second, 1 sigma.
+        attitude_turn_error: change of that offset as a share of the angle turned, 1 sigma.
+        turn_rate_deg_s: unknown rotation when the autopilot sends no attitude, 1 sigma.
+    """
+
+    acceleration_m_s2: float = 3.0
+    speed_m_s: float = 5.0
+    attitude_sigma_deg: float = 0.3
+    attitude_drift_deg_s: float = 0.1
+    attitude_turn_error: float = 0.02
+    turn_rate_deg_s: float = 45.0
+
+    def __post_init__(self) -> None:
+        for name in (
+            "acceleration_m_s2",
+            "speed_m_s",
+            "attitude_sigma_deg",
+            "attitude_drift_deg_s",
+            "turn_rate_deg_s",
+        ):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if not 0 <= self.attitude_turn_error < 1:
+            raise ValueError(
+                f"attitude_turn_error must lie in [0, 1), got {self.attitude_turn_error}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class FilterState:
+    """What the filter believes at one instant.
+
+    Attributes:
+        at_ns: the instant, host clock.
+        world_from_body: pose.
+        velocity_world: (3,) m/s.
+        world_from_ned: (3, 3) offset of the autopilot's attitude.
+        ned_from_body: (3, 3) the attitude sample of this instant, or None.
+        covariance: (12 + 6V, 12 + 6V), see the module.
+        own_map_covariance: (6, 6) local, the used landmarks' own errors.
+        fixed_at_ns: instant of the last fix.
+        n_jumps: how often the estimate moved by more than its covariance explains.
+    """
+
+    at_ns: int
+    world_from_body: Pose
+    velocity_world: Array
+    world_from_ned: Array
+    ned_from_body: Array | None
+    covariance: Array
+    own_map_covariance: Array
+    fixed_at_ns: int
+    n_jumps: int
+
+    def pose_covariance(self) -> Array:
+        """Return (6, 6) covariance of the pose, local perturbation, the map's error in it."""
+        to_pose = _to_pose(self.world_from_body.rotation, len(self.covariance))
+        out = to_pose @ self.covariance @ to_pose.T + self.own_map_covariance
+        return np.asarray(0.5 * (out + out.T))
+
+    def prior(self) -> Prior:
+        """Return where the drone is expected, for guiding the matching."""
+        return Prior(self.world_from_body, self.pose_covariance())
+
+
+def started(
+    fix: Localized, at_ns: int, ned_from_body: Array | None, options: FilterOptions
+) -> FilterState:
+    """Begin from a single fix, with unknown speed."""
+    rotation = fix.world_from_body.rotation
+    attitude = np.eye(3) if ned_from_body is None else ned_from_body
+    sample_sigma_rad = _sample_sigma_rad(ned_from_body, options)
+    n_map = fix.map_lever.shape[1]
+    # Independent sources: the fix's noise, the sample's error, speed, the keyframes.
+    sources = np.zeros((_N_OWN + n_map, _N_OWN + n_map))
+    sources[:6, :6] = fix.noise_covariance + fix.own_map_covariance
+    sources[6:9, 6:9] = np.eye(3) * options.speed_m_s**2
+    sources[9:12, 9:12] = np.eye(3) * sample_sigma_rad**2
+    sources[_N_OWN:, _N_OWN:] = fix.keyframe_covariance
+    mixing = np.eye(_N_OWN + n_map)
+    mixing[:6, :6] = 0.0
+    mixing[_P, 0:3] = mixing[_B, 3:6] = mixing[_B, _W] = -rotation
+    mixing[_P, _N_OWN:] = -rotation @ fix.map_lever[:3]
+    mixing[_B, _N_OWN:] = -rotation @ fix.map_lever[3:]
+    return FilterState(
+        at_ns,
+        fix.world_from_body,
+        np.zeros(3),
+        rotation @ attitude.T,
+        ned_from_body,
+        mixing @ sources @ mixing.T,
+        fix.own_map_covariance,
+        at_ns,
+        0,
+    )
+
+
+def predict(
+    state: FilterState, at_ns: int, ned_from_body: Array | None, options: FilterOptions
+) -> FilterState | None:
+    """Carry the state to a later instant (eq. 5): constant velocity, the autopilot's attitude.
+
+    Args:
+        state: at its own instant.
+        at_ns: the instant wanted; one before the state's leaves it where it is.
+        ned_from_body: (3, 3) attitude then, or None.
+        options: process noise.
+
+    Returns:
+        The predicted state; None a minute after the last fix, when it tells nothing.
+    """
+    if at_ns - state.fixed_at_ns > _MAX_COAST_S * 1e9:
+        return None
+    dt_s = max(at_ns - state.at_ns, 0) * 1e-9
+    n = len(state.covariance)
+    transition = np.eye(n)
+    transition[_P, _V] = np.eye(3) * dt_s
+    transition[_W] = 0.0
+    process = np.zeros((n, n))
+    # White acceleration, constant over the step: moves position by a dt^2/2, speed by a dt.
+    shove = np.zeros((n, 3))
+    shove[_P], shove[_V] = np.eye(3) * 0.5 * dt_s**2, np.eye(3) * dt_s
+    process += options.acceleration_m_s2**2 * shove @ shove.T
+    if ned_from_body is not None and state.ned_from_body is not None:
+        offset = state.world_from_ned
+        turn_rad = float(np.linalg.norm(log_so3(state.ned_from_body.T @ ned_from_body)))
+        variance = np.deg2rad(options.attitude_drift_deg_s) ** 2 * dt_s
+        variance += (options.attitude_turn_error * turn_rad) ** 2
+    else:
+        # The last rotation itself becomes the reference, and may have turned meanwhile.
+        attitude = np.eye(3) if ned_from_body is None else ned_from_body
+        offset = state.world_from_body.rotation @ attitude.T
+        transition[_B, _W] = state.world_from_body.rotation
+        variance = (np.deg2rad(options.turn_rate_deg_s) * dt_s) ** 2
+    process[_B, _B] += np.eye(3) * variance
+    process[_W, _W] = np.eye(3) * _sample_sigma_rad(ned_from_body, options) ** 2
+    rotation = offset @ (np.eye(3) if ned_from_body is None else ned_from_body)
+    turned = np.zeros((6, 6))
+    turned[:3, :3] = turned[3:, 3:] = rotation.T @ state.world_from_body.rotation
+    return replace(
+        state,
+        at_ns=max(at_ns, state.at_ns),
+        world_from_body=Pose(
+            rotation, state.world_from_body.translation + state.velocity_world * dt_s
+        ),
+        world_from_ned=offset,
+        ned_from_body=ned_from_body,
+        covariance=transition @ state.covariance @ transition.T + process,
+        own_map_covariance=turned @ state.own_map_covariance @ turned.T,
+    )
+
+
+def update(predicted: FilterState, fix: Localized) -> FilterState | NotLocalized:
+    """Take a fix of the same instant in (eqs. 6 and 7).
+
+    A fix whose position the covariances cannot explain (a relocalization, a
+    prediction gone wrong) replaces position and speed and counts as a jump. One
+    whose rotation contradicts the autopilot's turn since the last fix is wrong:
+    repeated structure, a planar twin.
+    """
+    predicted = _with_map(predicted, fix)
+    innovation = predicted.world_from_body.local(fix.world_from_body)
+    observation = _observation(predicted, fix)
+    noise = fix.noise_covariance + fix.own_map_covariance
+    expected = observation @ predicted.covariance @ observation.T + noise
+    distance = innovation[3:] @ np.linalg.solve(expected[3:, 3:], innovation[3:])
+    if distance > _GATE_ROTATION and predicted.ned_from_body is not None:
+        degrees = np.rad2deg(np.linalg.norm(innovation[3:]))
+        return NotLocalized(
+            f"turned {degrees:.0f} degrees against the autopilot's attitude",
+            fix.n_matched,
+            fix.n_inliers,
+        )
+    if innovation @ np.linalg.solve(expected, innovation) > _GATE_POSE:
+        predicted = _place_forgotten(predicted)
+        expected = observation @ predicted.covariance @ observation.T + noise
+    gain = np.linalg.solve(expected, observation @ predicted.covariance).T
+    gain[_N_OWN:] = 0.0  # considered, not estimated
+    step = gain @ innovation
+    # Joseph's form holds for any gain, so for a considered state too.
+    keep = np.eye(len(predicted.covariance)) - gain @ observation
+    covariance = keep @ predicted.covariance @ keep.T + gain @ noise @ gain.T
+    offset = exp_so3(step[_B]) @ predicted.world_from_ned
+    attitude = np.eye(3) if predicted.ned_from_body is None else predicted.ned_from_body
+    return replace(
+        predicted,
+        world_from_body=Pose(
+            offset @ attitude @ exp_so3(step[_W]),
+            predicted.world_from_body.translation + step[_P],
+        ),
+        velocity_world=predicted.velocity_world + step[_V],
+        world_from_ned=offset,
+        covariance=0.5 * (covariance + covariance.T),
+        own_map_covariance=fix.own_map_covariance,
+        fixed_at_ns=predicted.at_ns,
+    )
+
+
+def _sample_sigma_rad(ned_from_body: Array | None, options: FilterOptions) -> float:
+    """Without attitude the sample is an exact identity, and the offset is the rotation itself."""
+    return 0.0 if ned_from_body is None else float(np.deg2rad(options.attitude_sigma_deg))
+
+
+def _to_pose(rotation: Array, n: int) -> Array:
+    """Return (6, n) local pose perturbation by error state."""
+    out = np.zeros((6, n))
+    out[:3, _P] = out[3:, _B] = rotation.T
+    out[3:, _W] = np.eye(3)
+    return out
+
+
+def _observation(predicted: FilterState, fix: Localized) -> Array:
+    """Return (6, n): a fix sees the true pose, moved by the keyframes' errors."""
+    out = _to_pose(predicted.world_from_body.rotation, len(predicted.covariance))
+    out[:, _N_OWN:] = fix.map_lever
+    return out
+
+
+def _with_map(state: FilterState, fix: Localized) -> FilterState:
+    """Return the state with the keyframe errors of the fix's map, new ones when it changed."""
+    known = state.covariance[_N_OWN:, _N_OWN:]
+    if known.shape == fix.keyframe_covariance.shape and np.array_equal(
+        known, fix.keyframe_covariance
+    ):
+        return state
+    n_map = fix.map_lever.shape[1]
+    covariance = np.zeros((_N_OWN + n_map, _N_OWN + n_map))
+    covariance[:_N_OWN, :_N_OWN] = state.covariance[:_N_OWN, :_N_OWN]
+    covariance[_N_OWN:, _N_OWN:] = fix.keyframe_covariance
+    return replace(state, covariance=covariance)
+
+
+def _place_forgotten(state: FilterState) -> FilterState:
+    """Return the state that knows nothing of where it is, but still how it is turned."""
+    covariance = state.covariance.copy()
+    for part, sigma in ((_P, _FORGOTTEN_M), (_V, 10.0)):
+        covariance[part] = covariance[:, part] = 0.0
+        covariance[part, part] = np.eye(3) * sigma**2
+    return replace(
+        state, covariance=covariance, velocity_world=np.zeros(3), n_jumps=state.n_jumps + 1
+    )

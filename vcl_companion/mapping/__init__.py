@@ -1,0 +1,1 @@
+"""The shared map: built, scaled, updated (IV-C, IV-G)."""

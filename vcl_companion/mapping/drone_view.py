@@ -1,0 +1,90 @@
+"""What one drone contributes to a map: an image, where it looked, and what is in it."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.vision.features import Features, Image
+
+
+@dataclass(frozen=True, eq=False)
+class DroneView:
+    """One image of one drone.
+
+    Attributes:
+        drone_id: its system id.
+        captured_at_ns: when, on its own clock.
+        camera: its intrinsics.
+        body_from_cam: its camera's mounting.
+        ned_from_body: (3, 3) attitude from its autopilot at that instant, or None.
+        image_bytes: the encoded image, as exchanged.
+        features: found in that image, one set for each detector the builder uses.
+    """
+
+    drone_id: int
+    captured_at_ns: int
+    camera: Camera
+    body_from_cam: Pose
+    ned_from_body: Array | None
+    image_bytes: bytes
+    features: tuple[Features, ...]
+
+    @property
+    def pixels(self) -> Array:
+        """(N, 2) raw pixels of all its features, one detector after the other."""
+        return np.concatenate([f.pixels for f in self.features])
+
+
+def encode_image(image: Image, quality: int) -> bytes:
+    """Return a grey image as WebP, the form in which drones exchange it.
+
+    Args:
+        image: (H, W) uint8.
+        quality: 1 to 100.
+    """
+    ok, buffer = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])
+    if not ok:
+        raise ValueError(f"an image of shape {image.shape} cannot be encoded")
+    return bytes(buffer)
+
+
+def decode_image(image_bytes: bytes, camera: Camera) -> Image:
+    """Return the (H, W) uint8 grey image of encoded bytes.
+
+    Everybody, the sender too, uses the decoded image, so that all derive the
+    same features from it.
+
+    Raises:
+        ValueError: the bytes are no image, or not of the camera's size.
+    """
+    size_px = _webp_size_px(image_bytes)
+    if size_px != (camera.width_px, camera.height_px):
+        # Told before decoding: a few hostile bytes may claim gigabytes of pixels.
+        raise ValueError(
+            f"a keyframe's image is no WebP of {camera.width_px}x{camera.height_px}: {size_px}"
+        )
+    image = cv2.imdecode(np.frombuffer(image_bytes, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if image is None or image.shape != (camera.height_px, camera.width_px):
+        raise ValueError("a keyframe's image cannot be decoded")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _webp_size_px(image_bytes: bytes) -> tuple[int, int] | None:
+    """Return (width, height) by the header of a plain lossy WebP, the form that is exchanged.
+
+    RIFF container: "RIFF" size "WEBP" "VP8 " size, a 3-byte frame tag, the start
+    code 9d 01 2a, then 14 bits each of width and height (RFC 9649, RFC 6386).
+    """
+    if len(image_bytes) < 30 or image_bytes[:4] != b"RIFF" or image_bytes[8:16] != b"WEBPVP8 ":
+        return None
+    if image_bytes[23:26] != b"\x9d\x01\x2a":
+        return None
+    width, height = struct.unpack_from("<HH", image_bytes, 26)
+    return width & 0x3FFF, height & 0x3FFF

@@ -1,0 +1,92 @@
+"""The map the swarm shares: keyframes and the landmarks seen in them (IV-C).
+
+Descriptors are not part of it: whoever needs them computes them from the
+keyframe images, which every holder of the map has. Neither is the covariance:
+it follows from the geometry (``map_uncertainty``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """One image that landmarks are anchored in.
+
+    Attributes:
+        drone_id: system id of the drone that took it.
+        captured_at_ns: when, on that drone's own clock.
+        world_from_body: where that drone was.
+        body_from_cam: its camera's mounting.
+        camera: its camera's intrinsics.
+        image_bytes: the encoded image (WebP), byte for byte as exchanged.
+    """
+
+    drone_id: int
+    captured_at_ns: int
+    world_from_body: Pose
+    body_from_cam: Pose
+    camera: Camera
+    image_bytes: bytes
+
+
+@dataclass(frozen=True)
+class KnownDistance:
+    """A measured distance between the bodies of two keyframes: where metres come from."""
+
+    keyframe_a: int
+    keyframe_b: int
+    distance_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkMap:
+    """One immutable revision of the shared map.
+
+    Attributes:
+        keyframes: V images, the first one taken by the leader fixes the frame.
+        points_world: (N, 3) landmarks, world frame, m.
+        observed_px: (N, V, 2) pixel of every landmark in every keyframe's raw
+            image; NaN where it was not seen there.
+        pixel_noise_px: 1-sigma noise of ``observed_px``, as the adjustment found it.
+        detectors: which features the landmarks are: akaze, sift, orb.
+        distances: what the scale rests on.
+        parent: revision this one was made from; empty for a first map.
+    """
+
+    keyframes: tuple[Keyframe, ...]
+    points_world: Array
+    observed_px: Array
+    pixel_noise_px: float
+    detectors: tuple[str, ...]
+    distances: tuple[KnownDistance, ...]
+    parent: bytes
+
+    def __post_init__(self) -> None:
+        n, v = len(self.points_world), len(self.keyframes)
+        for name, shape in (("points_world", (n, 3)), ("observed_px", (n, v, 2))):
+            value = np.array(getattr(self, name), dtype=np.float64)
+            if value.shape != shape:
+                raise ValueError(f"LandmarkMap.{name} has shape {value.shape}, expected {shape}")
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        if not np.all(np.isfinite(self.points_world)):
+            raise ValueError("LandmarkMap.points_world must be finite")
+        if not (np.isfinite(self.pixel_noise_px) and self.pixel_noise_px > 0):
+            raise ValueError(f"LandmarkMap.pixel_noise_px must be positive: {self.pixel_noise_px}")
+        for distance in self.distances:
+            if not (0 <= distance.keyframe_a < v and 0 <= distance.keyframe_b < v):
+                raise ValueError(f"LandmarkMap: a known distance names no keyframe: {distance}")
+
+    @property
+    def seen(self) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
+        """(N, V) whether landmark j was seen in keyframe i."""
+        return np.asarray(np.isfinite(self.observed_px[:, :, 0]))

@@ -1,0 +1,92 @@
+"""How well the map is known: derived from its geometry, never transmitted (IV-F).
+
+The joint covariance of keyframe poses and landmarks is the inverse of the
+bundle adjustment's normal matrix, which needs only poses, points and who saw
+what. It is kept factored: each landmark has an error of its own, and one it
+shares with all others through the keyframe poses. The shared part does not
+average out over landmarks or frames and is what fusing must not forget.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.vision.bundle import Distance, Views, normal_equations
+
+
+@dataclass(frozen=True, eq=False)
+class MapUncertainty:
+    """The joint covariance of a map, factored.
+
+    Attributes:
+        keyframe_covariance: (6V, 6V) of the keyframe bodies, local perturbations.
+        landmark_covariance: (N, 3, 3) of each landmark were the keyframes exact, m^2.
+        landmark_lever: (N, 3, 6V) landmark error per keyframe error.
+    """
+
+    keyframe_covariance: Array
+    landmark_covariance: Array
+    landmark_lever: Array
+
+    def marginal(self) -> Array:
+        """Return (N, 3, 3) the whole covariance of each landmark, m^2."""
+        shared = self.landmark_lever @ self.keyframe_covariance
+        return self.landmark_covariance + shared @ np.swapaxes(self.landmark_lever, 1, 2)
+
+
+def views_of(landmark_map: LandmarkMap) -> Views:
+    """Return the map as the bundle adjustment sees it."""
+    keyframes = landmark_map.keyframes
+    ideal = np.full(landmark_map.observed_px.shape, np.nan)
+    for i, keyframe in enumerate(keyframes):
+        ideal[:, i] = keyframe.camera.ideal_from_pixels(landmark_map.observed_px[:, i])
+    return Views(
+        bodies=tuple(k.world_from_body for k in keyframes),
+        mountings=tuple(k.body_from_cam for k in keyframes),
+        focal_px=np.array([k.camera.focal_px for k in keyframes]),
+        ideal=ideal,
+        points=landmark_map.points_world,
+        distances=tuple(
+            Distance(d.keyframe_a, d.keyframe_b, d.distance_m, d.sigma_m)
+            for d in landmark_map.distances
+        ),
+    )
+
+
+def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
+    """Compute the joint covariance of keyframes and landmarks.
+
+    Raises:
+        ValueError: the map's observations do not fix it (no known distance, a
+            keyframe that shares nothing).
+    """
+    noise = landmark_map.pixel_noise_px
+    views = views_of(landmark_map)
+    # Distances enter in units of their own sigma; pixels in px: bring both to sigmas.
+    scaled = Views(
+        views.bodies,
+        views.mountings,
+        views.focal_px / noise,
+        views.ideal,
+        views.points,
+        views.distances,
+    )
+    system = normal_equations(scaled, None)
+    try:
+        inverse = np.linalg.inv(system.point_block)
+        lever = -np.swapaxes(system.cross @ inverse, 1, 2)
+        reduced = system.pose_block + np.einsum("nji,nkj->ik", lever, system.cross)
+        covariance = np.zeros_like(reduced)
+        covariance[6:, 6:] = np.linalg.inv(reduced[6:, 6:])
+    except np.linalg.LinAlgError as error:
+        raise ValueError("the map's observations do not fix it") from error
+    diagonal = np.diag(covariance)
+    if not np.all(np.isfinite(covariance)) or np.any(diagonal < 0):
+        raise ValueError("the map's observations do not fix it")
+    return MapUncertainty(
+        0.5 * (covariance + covariance.T), np.asarray(inverse, dtype=np.float64), lever
+    )

@@ -1,0 +1,278 @@
+"""Bundle adjustment of a few views and many points by the Schur complement (IV-C).
+
+Poses are bodies, not cameras, so that a known distance between two drones and
+the mounting of each camera enter as they are. The first view is held: it fixes
+position and orientation of the frame; known distances fix the scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array, skew
+
+_MIN_DEPTH_M = 1e-3
+
+
+@dataclass(frozen=True)
+class Distance:
+    """The bodies of views ``a`` and ``b`` are ``distance_m`` apart, give or take ``sigma_m``."""
+
+    a: int
+    b: int
+    distance_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """What was seen from where.
+
+    Attributes:
+        bodies: V world_from_body poses; the first is held fixed.
+        mountings: V body_from_cam poses.
+        focal_px: (V,) px per unit of the ideal image plane, to weigh residuals in px.
+        ideal: (N, V, 2) observations as ideal image coordinates x/z, y/z; NaN where unseen.
+        points: (N, 3) landmarks, world frame, m.
+        distances: what fixes the scale.
+    """
+
+    bodies: tuple[Pose, ...]
+    mountings: tuple[Pose, ...]
+    focal_px: Array
+    ideal: Array
+    points: Array
+    distances: tuple[Distance, ...]
+
+
+@dataclass(frozen=True)
+class BundleOptions:
+    """When to stop, and how much an outlier may pull.
+
+    Attributes:
+        max_iterations: Levenberg-Marquardt steps.
+        cauchy_px: residual at which an observation's weight has fallen to one half.
+    """
+
+    max_iterations: int = 40
+    cauchy_px: float = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """The Gauss-Newton system at one estimate, landmarks not yet eliminated.
+
+    Attributes:
+        pose_block: (6V, 6V) normal matrix of the poses, distances included.
+        pose_rhs: (6V,) negative gradient.
+        point_block: (N, 3, 3) normal matrix of each point.
+        point_rhs: (N, 3) negative gradient.
+        cross: (N, 6V, 3) pose-point coupling.
+        cost: robust cost, px^2 (distances weighted to the same unit).
+    """
+
+    pose_block: Array
+    pose_rhs: Array
+    point_block: Array
+    point_rhs: Array
+    cross: Array
+    cost: float
+
+
+def reprojection_residuals(views: Views) -> Array:
+    """Return (N, V, 2) projected minus observed, px; NaN where unseen or behind the camera."""
+    out = np.full(views.ideal.shape, np.nan)
+    for i in range(len(views.bodies)):
+        points_cam = _world_from_cam(views, i).inverse().apply(views.points)
+        z = np.where(points_cam[:, 2] > _MIN_DEPTH_M, points_cam[:, 2], np.nan)
+        out[:, i] = (points_cam[:, :2] / z[:, None] - views.ideal[:, i]) * views.focal_px[i]
+    return out
+
+
+def adjust(views: Views, options: BundleOptions) -> tuple[Views, float]:
+    """Move poses and points until the robust reprojection error is least.
+
+    Args:
+        views: the first estimate. Every point should be seen at least twice.
+        options: stopping rule and robust scale.
+
+    Returns:
+        The adjusted views, and the robust noise of one pixel coordinate (1
+        sigma, px, from the median absolute residual).
+    """
+    damping = 1e-4
+    system = normal_equations(views, options.cauchy_px)
+    for _ in range(options.max_iterations):
+        step = _solve(system, damping)
+        if step is None:
+            damping *= 10.0
+            if damping > 1e8:
+                break
+            continue
+        candidate = _moved(views, *step)
+        new_system = normal_equations(candidate, options.cauchy_px)
+        if new_system.cost < system.cost:
+            converged = system.cost - new_system.cost < 1e-7 * system.cost
+            views, system, damping = candidate, new_system, max(damping / 5.0, 1e-9)
+            if converged:
+                break
+        else:
+            damping *= 6.0
+            if damping > 1e8:
+                break
+    return views, residual_noise_px(reprojection_residuals(views))
+
+
+def residual_noise_px(residuals: Array) -> float:
+    """Return the robust 1-sigma of one pixel coordinate behind (N, V, 2) residuals, px.
+
+    A point seen V times leaves 2V - 3 degrees of freedom of its own; the median
+    over the points of its squared residuals against the median of that
+    chi-square distribution ignores up to half of the points being wrong.
+    """
+    seen = np.isfinite(residuals[..., 0])
+    n_seen = seen.sum(axis=1)
+    usable = n_seen >= 2
+    if not usable.any():
+        return 1.0
+    squared = np.nansum(residuals[usable] ** 2, axis=(1, 2))
+    expected = np.asarray(chi2.median(2 * n_seen[usable] - 3))
+    return float(max(np.sqrt(np.median(squared / expected)), 0.02))
+
+
+def normal_equations(views: Views, cauchy_px: float | None) -> NormalEquations:
+    """Linearise every observation and distance at the present estimate (eq. 4, many views).
+
+    Args:
+        views: where to linearise.
+        cauchy_px: scale of the robust weight; None weighs all observations one.
+    """
+    n, v = views.ideal.shape[:2]
+    pose_block = np.zeros((6 * v, 6 * v))
+    pose_rhs = np.zeros(6 * v)
+    point_block = np.zeros((n, 3, 3))
+    point_rhs = np.zeros((n, 3))
+    cross = np.zeros((n, 6 * v, 3))
+    cost = 0.0
+    for i in range(v):
+        seen = np.flatnonzero(np.isfinite(views.ideal[:, i, 0]))
+        if len(seen) == 0:
+            continue
+        residual, j_pose, j_point = linearized(
+            views.bodies[i],
+            views.mountings[i],
+            views.focal_px[i],
+            views.points[seen],
+            views.ideal[seen, i],
+        )
+        weight, loss = _robust(residual, cauchy_px)
+        cost += loss
+        weighted_pose = j_pose * weight[:, None, None]
+        weighted_point = j_point * weight[:, None, None]
+        block = slice(6 * i, 6 * i + 6)
+        pose_block[block, block] += np.einsum("nki,nkj->ij", weighted_pose, j_pose)
+        pose_rhs[block] -= np.einsum("nki,nk->i", weighted_pose, residual)
+        point_block[seen] += np.einsum("nki,nkj->nij", weighted_point, j_point)
+        point_rhs[seen] -= np.einsum("nki,nk->ni", weighted_point, residual)
+        cross[seen, block] += np.einsum("nki,nkj->nij", weighted_pose, j_point)
+    for known in views.distances:
+        cost += _add_distance(views, known, pose_block, pose_rhs)
+    return NormalEquations(pose_block, pose_rhs, point_block, point_rhs, cross, cost)
+
+
+def linearized(
+    world_from_body: Pose, body_from_cam: Pose, focal_px: float, points: Array, ideal: Array
+) -> tuple[Array, Array, Array]:
+    """Residuals of one view and their Jacobians.
+
+    Args:
+        world_from_body: the view's pose, perturbed locally.
+        body_from_cam: its mounting.
+        focal_px: px per ideal unit.
+        points: (N, 3) landmarks, world frame, m.
+        ideal: (N, 2) where they were seen, ideal coordinates.
+
+    Returns:
+        (N, 2) residuals, px; (N, 2, 6) by the pose; (N, 2, 3) by the point.
+        A point at or behind the camera gets a large residual and no slope.
+    """
+    cam_from_body = body_from_cam.rotation.T
+    points_body = (points - world_from_body.translation) @ world_from_body.rotation
+    points_cam = (points_body - body_from_cam.translation) @ body_from_cam.rotation
+    front = points_cam[:, 2] > _MIN_DEPTH_M
+    z = np.where(front, points_cam[:, 2], 1.0)
+    uv = points_cam[:, :2] / z[:, None]
+    residual = (uv - ideal) * focal_px
+    residual[~front] = 1e3
+    j_cam = np.zeros((len(points), 2, 3))
+    j_cam[:, 0, 0] = j_cam[:, 1, 1] = focal_px / z
+    j_cam[:, :, 2] = -focal_px * uv / z[:, None]
+    j_cam[~front] = 0.0
+    j_body = j_cam @ cam_from_body
+    j_pose = np.empty((len(points), 2, 6))
+    # Moving the body by d moves the point by -d in body axes; turning it by w, by -w x p.
+    j_pose[:, :, :3] = -j_body
+    j_pose[:, :, 3:] = j_body @ skew(points_body)
+    return residual, j_pose, j_body @ world_from_body.rotation.T
+
+
+def _robust(residual: Array, cauchy_px: float | None) -> tuple[Array, float]:
+    squared = np.einsum("nk,nk->n", residual, residual)
+    if cauchy_px is None:
+        return np.ones(len(residual)), float(squared.sum())
+    scaled = squared / cauchy_px**2
+    return 1.0 / (1.0 + scaled), float(cauchy_px**2 * np.log1p(scaled).sum())
+
+
+def _add_distance(views: Views, known: Distance, pose_block: Array, pose_rhs: Array) -> float:
+    a, b = views.bodies[known.a], views.bodies[known.b]
+    offset = a.translation - b.translation
+    length = max(float(np.linalg.norm(offset)), 1e-9)
+    jacobian = np.zeros(len(pose_rhs))
+    jacobian[6 * known.a : 6 * known.a + 3] = offset / length @ a.rotation
+    jacobian[6 * known.b : 6 * known.b + 3] = -offset / length @ b.rotation
+    error = (length - known.distance_m) / known.sigma_m
+    jacobian /= known.sigma_m
+    pose_block += np.outer(jacobian, jacobian)
+    pose_rhs -= jacobian * error
+    return error**2
+
+
+def _solve(system: NormalEquations, damping: float) -> tuple[Array, Array] | None:
+    """Return the damped (6V,) pose step and (N, 3) point step; None where singular."""
+    point_block = system.point_block.copy()
+    diagonal = np.arange(3)
+    point_block[:, diagonal, diagonal] *= 1.0 + damping
+    point_block[:, diagonal, diagonal] += 1e-9
+    try:
+        inverse = np.linalg.inv(point_block)
+        coupled = system.cross @ inverse
+        reduced = system.pose_block - np.einsum("nij,nkj->ik", coupled, system.cross)
+        rhs = system.pose_rhs - np.einsum("nij,nj->i", coupled, system.point_rhs)
+        free = slice(6, len(rhs))
+        damped = reduced[free, free] + damping * np.diag(np.diag(system.pose_block)[free])
+        pose_step = np.zeros(len(rhs))
+        pose_step[free] = np.linalg.solve(damped, rhs[free])
+    except np.linalg.LinAlgError:
+        return None
+    back = system.point_rhs - np.einsum("nij,i->nj", system.cross, pose_step)
+    point_step = np.einsum("nij,nj->ni", inverse, back)
+    if not (np.all(np.isfinite(pose_step)) and np.all(np.isfinite(point_step))):
+        return None
+    return pose_step, point_step
+
+
+def _moved(views: Views, pose_step: Array, point_step: Array) -> Views:
+    bodies = tuple(
+        body.retracted(pose_step[6 * i : 6 * i + 6]) if i else body
+        for i, body in enumerate(views.bodies)
+    )
+    return replace(views, bodies=bodies, points=views.points + point_step)
+
+
+def _world_from_cam(views: Views, i: int) -> Pose:
+    return views.bodies[i] @ views.mountings[i]

@@ -1,0 +1,183 @@
+"""Which feature is which: brute force with ratio test, and guided by a prediction (IV-A, IV-D)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.vision.features import Features
+
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """When two descriptors are the same place.
+
+    Attributes:
+        ratio: best distance over second best must be below (Lowe's test), whole-image search.
+        guided_ratio: the same among the candidates near a predicted position.
+    """
+
+    ratio: float = 0.85
+    guided_ratio: float = 0.9
+
+    def __post_init__(self) -> None:
+        if not 0 < self.ratio <= 1 or not 0 < self.guided_ratio <= 1:
+            raise ValueError("match ratios must lie in (0, 1]")
+
+
+def match_mutual(a: Features, b: Features, options: MatchOptions) -> tuple[Index, Index]:
+    """Match two images: each other's best, and clearly better than the next.
+
+    Returns:
+        (M,) indices into ``a`` and (M,) into ``b``.
+    """
+    if len(a) < 2 or len(b) < 2:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    matcher = cv2.BFMatcher(_norm(a))
+    forward = _knn(matcher, a, b, 2)
+    backward = _knn(matcher, b, a, 1)
+    best, distance = forward
+    ids = np.arange(len(a))
+    ok = (distance[:, 0] < options.ratio * distance[:, 1]) & (backward[0][best[:, 0], 0] == ids)
+    return ids[ok], best[ok, 0]
+
+
+def match_to_entries(
+    features: Features, entries: Features, owner: Index, options: MatchOptions
+) -> tuple[Index, Index]:
+    """Match an image against a map whose landmarks have one or more descriptors each.
+
+    Args:
+        features: of the image, N of them.
+        entries: M descriptors of the map.
+        owner: (M,) landmark that each entry belongs to.
+        options: the ratio is taken against the best entry of *another* landmark.
+
+    Returns:
+        (K,) features and (K,) landmarks, one to one: of several features that
+        chose one landmark the closest stays.
+    """
+    if len(features) < 1 or len(entries) < 4:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    best, distance = _knn(cv2.BFMatcher(_norm(features)), features, entries, 4)
+    owners = owner[best]
+    other = owners != owners[:, :1]
+    second = np.where(
+        other.any(axis=1), distance[np.arange(len(best)), other.argmax(axis=1)], distance[:, -1]
+    )
+    return _one_to_one(
+        np.flatnonzero(distance[:, 0] < options.ratio * second), owners[:, 0], distance[:, 0]
+    )
+
+
+def match_guided(
+    features: Features,
+    entries: Features,
+    owner: Index,
+    predicted_px: Array,
+    radius_px: float,
+    options: MatchOptions,
+) -> tuple[Index, Index]:
+    """Match an image against landmarks whose positions in it are predicted.
+
+    Args:
+        features: of the image.
+        entries: M descriptors of the map.
+        owner: (M,) landmark of each entry.
+        predicted_px: (L, 2) where each landmark should appear in the raw image;
+            NaN where it cannot.
+        radius_px: how far from there to look.
+        options: ``guided_ratio`` among the candidates of one landmark.
+
+    Returns:
+        (K,) features and (K,) landmarks, one to one.
+    """
+    visible = np.flatnonzero(np.isfinite(predicted_px[owner, 0]))
+    if len(features) == 0 or len(visible) == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    predicted = cKDTree(predicted_px[owner[visible]])
+    near = predicted.sparse_distance_matrix(
+        cKDTree(features.pixels), radius_px, output_type="ndarray"
+    )
+    if len(near) == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    entry = visible[near["i"]]
+    candidate = np.asarray(near["j"], dtype=np.intp)
+    distance = _distances(entries, entry, features, candidate)
+    landmark = owner[entry]
+    # Best and second best *feature* of each landmark over all its entries.
+    order = np.lexsort((distance, candidate, landmark))
+    landmark, candidate, distance = landmark[order], candidate[order], distance[order]
+    first_of_pair = np.ones(len(order), dtype=bool)
+    first_of_pair[1:] = (landmark[1:] != landmark[:-1]) | (candidate[1:] != candidate[:-1])
+    landmark, candidate, distance = (
+        landmark[first_of_pair],
+        candidate[first_of_pair],
+        distance[first_of_pair],
+    )
+    order = np.lexsort((distance, landmark))
+    landmark, candidate, distance = landmark[order], candidate[order], distance[order]
+    first = np.ones(len(landmark), dtype=bool)
+    first[1:] = landmark[1:] != landmark[:-1]
+    start = np.flatnonzero(first)
+    end = np.append(start[1:], len(landmark))
+    second = np.where(
+        end - start > 1, distance[np.minimum(start + 1, len(distance) - 1)], _worst(features)
+    )
+    ok = distance[start] < options.guided_ratio * np.minimum(second, _worst(features))
+    chosen = start[ok]
+    pick, _ = _one_to_one(np.arange(len(chosen)), candidate[chosen], distance[chosen])
+    return candidate[chosen][pick], landmark[chosen][pick]
+
+
+def _worst(features: Features) -> float:
+    """Return a distance between unrelated descriptors: what a lone candidate has to beat."""
+    if features.descriptors.dtype == np.uint8:
+        return 0.33 * 8 * int(features.descriptors.shape[1])
+    return 0.9
+
+
+def _norm(features: Features) -> int:
+    return cv2.NORM_HAMMING if features.descriptors.dtype == np.uint8 else cv2.NORM_L2
+
+
+def _knn(matcher: cv2.BFMatcher, a: Features, b: Features, k: int) -> tuple[Index, Array]:
+    """Return (N, k) indices into ``b`` and distances, padded by repeating the last."""
+    rows = matcher.knnMatch(a.descriptors, b.descriptors, k=min(k, len(b)))
+    index = np.array([[m.trainIdx for m in row] for row in rows], dtype=np.intp)
+    distance = np.array([[m.distance for m in row] for row in rows], dtype=np.float64)
+    missing = k - index.shape[1]
+    if missing > 0:
+        index = np.pad(index, ((0, 0), (0, missing)), mode="edge")
+        distance = np.pad(distance, ((0, 0), (0, missing)), mode="edge")
+    return index, distance
+
+
+def _distances(a: Features, i: Index, b: Features, j: Index) -> Array:
+    """Return (P,) distances of descriptor pairs."""
+    if a.descriptors.dtype == np.uint8:
+        different = np.bitwise_xor(a.descriptors[i], b.descriptors[j])
+        return np.asarray(np.bitwise_count(different).sum(axis=1), dtype=np.float64)
+    return np.asarray(np.linalg.norm(a.descriptors[i] - b.descriptors[j], axis=1), dtype=np.float64)
+
+
+def _one_to_one(candidates: Index, target: Index, distance: Array) -> tuple[Index, Index]:
+    """Keep, of the candidates that chose one target, the closest.
+
+    Args:
+        candidates: (K,) sources that passed their test.
+        target: (N,) what each source chose.
+        distance: (N,) how well.
+    """
+    order = candidates[np.lexsort((candidates, distance[candidates], target[candidates]))]
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = target[order][1:] != target[order][:-1]
+    keep = np.sort(order[first])
+    return keep, target[keep]

@@ -1,0 +1,252 @@
+"""A camera's pose from landmarks it sees: robust search, refinement, covariance (IV-D, IV-F).
+
+The search is P3P inside RANSAC; the refinement weighs every landmark by the
+pixel noise **and** by the landmark's own uncertainty as it appears in this
+image, so that a badly triangulated depth cannot pull the pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.vision.bundle import linearized
+
+Mask = NDArray[np.bool_]
+
+# 99 % of a two-dimensional Gaussian lies within this squared Mahalanobis distance.
+_CHI2_2_99 = 9.21
+_MAX_LEVERAGE = 0.4
+_MAX_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class ResectionOptions:
+    """How a pose is searched and when it is believed.
+
+    Attributes:
+        threshold_px: reprojection error of an inlier in the search.
+        min_inliers: fewer are refused.
+        max_iterations: RANSAC samples at most.
+    """
+
+    threshold_px: float = 4.0
+    min_inliers: int = 15
+    max_iterations: int = 2000
+
+    def __post_init__(self) -> None:
+        if self.threshold_px <= 0 or self.min_inliers < 6 or self.max_iterations < 10:
+            raise ValueError(
+                "resection needs threshold_px > 0, min_inliers >= 6, max_iterations >= 10"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Landmarks matched to one image.
+
+    Attributes:
+        ideal: (M, 2) where they were seen, ideal image coordinates x/z, y/z.
+        points: (M, 3) landmarks, world frame, m.
+        point_covariances: (M, 3, 3) of the landmarks, world frame, m^2.
+        focal_px: px per ideal unit.
+        body_from_cam: the camera's mounting.
+        noise_px: 1-sigma of one pixel coordinate, new in every image.
+        bias_px: (M,) 1-sigma of what a detector misplaces each of them by because
+            it looks different from here; the same in every image taken from here.
+    """
+
+    ideal: Array
+    points: Array
+    point_covariances: Array
+    focal_px: float
+    body_from_cam: Pose
+    noise_px: float
+    bias_px: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Resection:
+    """A pose found.
+
+    Attributes:
+        world_from_body: the pose.
+        inliers: (M,) which sightings support it.
+        gain: (M_in, 6, 2) the pose's local perturbation per px of residual of each inlier.
+        jacobian_pose: (M_in, 2, 6) residual by pose.
+        jacobian_points: (M_in, 2, 3) residual by landmark, px/m.
+        noise_covariance: (6, 6) from pixel noise alone, local perturbation (eq. 12).
+        bias_covariance: (6, 6) from ``bias_px``, likewise.
+        rms_px: of the inliers' reprojection errors.
+    """
+
+    world_from_body: Pose
+    inliers: Mask
+    gain: Array
+    jacobian_pose: Array
+    jacobian_points: Array
+    noise_covariance: Array
+    bias_covariance: Array
+    rms_px: float
+
+
+@dataclass(frozen=True)
+class NotFound:
+    """No pose can be believed, and why."""
+
+    reason: str
+
+
+def search(sightings: Sightings, options: ResectionOptions) -> Pose | NotFound:
+    """Find a pose that many sightings agree on, without any first guess (P3P, RANSAC)."""
+    n = len(sightings.points)
+    if n < options.min_inliers:
+        return NotFound(f"{n} landmarks matched, {options.min_inliers} needed")
+    focal = sightings.focal_px
+    ok, rvec, tvec, inliers = cv2.solvePnPRansac(
+        sightings.points,
+        sightings.ideal * focal,
+        np.diag([focal, focal, 1.0]),
+        None,
+        iterationsCount=options.max_iterations,
+        reprojectionError=options.threshold_px,
+        confidence=0.9999,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not ok or inliers is None or not np.all(np.isfinite(rvec)) or not np.all(np.isfinite(tvec)):
+        return NotFound(f"no pose agrees with {options.min_inliers} of {n} matched landmarks")
+    rotation, _ = cv2.Rodrigues(rvec)
+    cam_from_world = Pose(
+        np.asarray(rotation, dtype=np.float64), np.asarray(tvec, dtype=np.float64)[:, 0]
+    )
+    return (sightings.body_from_cam @ cam_from_world).inverse()
+
+
+def refine(
+    world_from_body: Pose, sightings: Sightings, options: ResectionOptions
+) -> Resection | NotFound:
+    """Refine a pose over all sightings that agree with it (eq. 4), with its covariance (eq. 12).
+
+    Args:
+        world_from_body: the first guess, good to some tens of px.
+        sightings: all matches, wrong ones among them.
+        options: how many must agree.
+
+    Returns:
+        The pose with its support, or why it is not to be believed.
+    """
+    usable = np.ones(len(sightings.points), dtype=bool)
+    for _ in range(_MAX_ROUNDS):
+        if usable.sum() < options.min_inliers:
+            return NotFound(f"{usable.sum()} landmarks matched, {options.min_inliers} needed")
+        pose = _converged(world_from_body, _of(sightings, usable))
+        if isinstance(pose, NotFound):
+            return pose
+        found = _supported(pose, sightings, usable, options)
+        if isinstance(found, NotFound):
+            return found
+        # On a flat scene one landmark off the plane, a wrong match perhaps, would
+        # fix the pose all by itself: the pose has to stand without such landmarks.
+        decisive = _leverage(found) > _MAX_LEVERAGE
+        if not decisive.any():
+            return found
+        usable[np.flatnonzero(found.inliers)[decisive]] = False
+        world_from_body = found.world_from_body
+    return NotFound("single landmarks decide the pose: the others do not fix it")
+
+
+def _converged(pose: Pose, sightings: Sightings) -> Pose | NotFound:
+    """Gauss-Newton with a redescending weight, wide at first."""
+    for scale in (8.0, 3.0, 1.0, 1.0):
+        for _ in range(4):
+            residual, j_pose, j_point = _linearized(pose, sightings)
+            information = _information(j_point, sightings, scale)
+            weighted = _weighted(residual, j_pose, information)
+            normal = np.einsum("nik,nkj->ij", weighted, j_pose)
+            rhs = -np.einsum("nik,nk->i", weighted, residual)
+            try:
+                step = np.linalg.solve(normal, rhs)
+            except np.linalg.LinAlgError:
+                return NotFound("the matched landmarks do not fix a pose")
+            length = float(np.linalg.norm(step))
+            if not np.isfinite(length) or length > 1e3:
+                return NotFound("the refinement of the pose diverged")
+            pose = pose.retracted(step)
+            if length < 1e-7:
+                break
+    return pose
+
+
+def _supported(
+    pose: Pose, sightings: Sightings, usable: Mask, options: ResectionOptions
+) -> Resection | NotFound:
+    """Find who agrees with a converged pose, and how well they fix it."""
+    residual, j_pose, j_point = _linearized(pose, sightings)
+    information = _information(j_point, sightings, 1.0)
+    squared = np.einsum("nk,nkl,nl->n", residual, information, residual)
+    inliers = usable & (squared < 2.0 * _CHI2_2_99)
+    n_inliers = int(inliers.sum())
+    if n_inliers < options.min_inliers:
+        return NotFound(f"{n_inliers} landmarks agree on a pose, {options.min_inliers} needed")
+    weighted = _weighted(residual[inliers], j_pose[inliers], information[inliers])
+    try:
+        inverse = np.linalg.inv(np.einsum("nik,nkj->ij", weighted, j_pose[inliers]))
+    except np.linalg.LinAlgError:
+        return NotFound("the matched landmarks do not fix a pose")
+    gain = np.einsum("ij,njk->nik", inverse, weighted)
+    by_landmark = gain @ np.swapaxes(gain, 1, 2)
+    return Resection(
+        pose,
+        np.asarray(inliers),
+        gain,
+        j_pose[inliers],
+        j_point[inliers],
+        by_landmark.sum(axis=0) * sightings.noise_px**2,
+        np.einsum("nij,n->ij", by_landmark, sightings.bias_px[inliers] ** 2),
+        float(np.sqrt((residual[inliers] ** 2).sum(axis=1).mean())),
+    )
+
+
+def _leverage(found: Resection) -> Array:
+    """Return (M_in,) how much of its most determined direction each inlier decides, 0 to 1."""
+    own = found.gain @ found.jacobian_pose
+    return np.asarray(np.abs(np.linalg.eigvals(own)).max(axis=1))
+
+
+def _of(sightings: Sightings, chosen: Mask) -> Sightings:
+    return replace(
+        sightings,
+        ideal=sightings.ideal[chosen],
+        points=sightings.points[chosen],
+        point_covariances=sightings.point_covariances[chosen],
+        bias_px=sightings.bias_px[chosen],
+    )
+
+
+def _weighted(residual: Array, j_pose: Array, information: Array) -> Array:
+    """Return (M, 6, 2) transposed Jacobians times information times robust weight."""
+    squared = np.einsum("nk,nkl,nl->n", residual, information, residual)
+    weight = 1.0 / (1.0 + squared / 4.0) ** 2
+    out = np.einsum("nki,nkl->nil", j_pose, information)
+    return np.asarray(out * weight[:, None, None])
+
+
+def _linearized(pose: Pose, sightings: Sightings) -> tuple[Array, Array, Array]:
+    return linearized(
+        pose, sightings.body_from_cam, sightings.focal_px, sightings.points, sightings.ideal
+    )
+
+
+def _information(j_point: Array, sightings: Sightings, scale: float) -> Array:
+    """Return (M, 2, 2) inverse covariances of the residuals: pixel noise and landmark error.
+
+    ``scale`` widens the noise in early iterations, when the pose is still off.
+    """
+    covariance = j_point @ sightings.point_covariances @ np.swapaxes(j_point, 1, 2)
+    covariance[:, [0, 1], [0, 1]] += sightings.noise_px**2 + sightings.bias_px[:, None] ** 2
+    return np.asarray(np.linalg.inv(covariance * scale**2))

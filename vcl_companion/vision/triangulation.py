@@ -1,0 +1,64 @@
+"""Points from rays of two or more cameras (IV-C), linear and then culled."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+
+
+def triangulate(worlds_from_cams: list[Pose], ideal: Array) -> Array:
+    """Find the points nearest to their rays, over every view that saw them.
+
+    Args:
+        worlds_from_cams: V camera poses.
+        ideal: (N, V, 2) ideal image coordinates x/z, y/z; NaN where unseen.
+
+    Returns:
+        (N, 3) points, world frame, m; NaN when seen by fewer than two views or
+        when the rays are parallel.
+    """
+    n = len(ideal)
+    normal = np.zeros((n, 4, 4))
+    for i, world_from_cam in enumerate(worlds_from_cams):
+        cam_from_world = world_from_cam.inverse()
+        rows = np.hstack([cam_from_world.rotation, cam_from_world.translation[:, None]])
+        seen = np.isfinite(ideal[:, i, 0])
+        uv = np.where(seen[:, None], ideal[:, i], 0.0)
+        # x (row 3 . X) - row 1 . X = 0, scaled by the ray's length so that views weigh alike
+        equations = uv[:, :, None] * rows[2] - rows[:2]
+        equations = equations / np.sqrt(1.0 + (uv**2).sum(axis=1))[:, None, None]
+        equations = equations * seen[:, None, None]
+        normal += np.einsum("nki,nkj->nij", equations, equations)
+    n_seen = np.isfinite(ideal[:, :, 0]).sum(axis=1)
+    _, vectors = np.linalg.eigh(normal)
+    homogeneous = vectors[:, :, 0]
+    w = homogeneous[:, 3]
+    ok = (n_seen >= 2) & (np.abs(w) > 1e-9)
+    points = homogeneous[:, :3] / np.where(ok, w, 1.0)[:, None]
+    points[~ok] = np.nan
+    return np.asarray(points)
+
+
+def ray_angles(worlds_from_cams: list[Pose], points: Array, seen: NDArray[np.bool_]) -> Array:
+    """Return (N,) the widest angle under which each point is seen, rad; 0 with one view.
+
+    Args:
+        worlds_from_cams: V camera poses.
+        points: (N, 3) landmarks, world frame, m.
+        seen: (N, V) bool.
+    """
+    widest = np.zeros(len(points))
+    rays = []
+    for world_from_cam in worlds_from_cams:
+        ray = points - world_from_cam.translation
+        rays.append(ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12))
+    for i in range(len(rays)):
+        for k in range(i):
+            both = seen[:, i] & seen[:, k]
+            cosine = np.einsum("nj,nj->n", rays[i], rays[k])
+            angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+            widest = np.where(both, np.maximum(widest, angle), widest)
+    return widest
