@@ -1,0 +1,150 @@
+"""The group: options that cannot be right, who is alive, who coordinates, who lacks the map."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vcl_companion.errors import ConfigError
+from vcl_companion.swarm.group import Group, PeerJoined, PeerLost, SwarmOptions
+from vcl_companion.wire.messages import MapState
+
+THREE = SwarmOptions(members=(3, 1, 2))
+OLD, NEW = MapState(b"old     ", 900, True), MapState(b"new     ", 1000, True)
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"members": (1, 251)}, "251 is not a system id"),
+        ({"members": (0, 1)}, "0 is not a system id"),
+        ({"members": (1, 2, 1)}, "twice"),
+        ({"members": (1, 2), "leader": 3}, "leader: 3"),
+        ({"leader": 1}, "leader: 1"),
+        ({"members": (1, 2), "known_distances": ((1, 3, 2.0),)}, "3 is not one of"),
+        ({"members": (1, 2), "known_distances": ((1, 1, 2.0),)}, "not between two"),
+        ({"members": (1, 2), "known_distances": ((1, 2, 0.0),)}, "finite and positive"),
+        ({"members": (1, 2), "known_distances": ((1, 2, float("nan")),)}, "finite and positive"),
+        ({"members": (1, 2), "known_distances": ((1, 2, 2.0), (2, 1, 2.0))}, "twice"),
+        ({"heartbeat_timeout_s": 0.0}, "heartbeat_timeout_s"),
+    ],
+)
+def test_options_that_cannot_be_right_are_one_clear_line(fields: dict[str, Any], says: str) -> None:
+    with pytest.raises(ConfigError, match=says) as caught:
+        SwarmOptions(**fields)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_drone_that_is_no_member_is_a_config_error() -> None:
+    with pytest.raises(ConfigError, match="system_id 4"):
+        Group(THREE, 4)
+
+
+def test_a_drone_alone_is_its_own_complete_group() -> None:
+    group = Group(SwarmOptions(), 7)
+    assert (group.members, group.alive, group.coordinator) == ((7,), (7,), 7)
+    assert group.is_complete
+    assert group.is_coordinator
+    assert group.poll(1e9) == []
+    assert group.next_poll_s() is None
+    group.set_own_state(NEW)
+    assert group.lacking() == ()
+
+
+def test_peers_join_once_are_lost_after_the_timeout_and_come_back() -> None:
+    group = Group(THREE, 1)
+    assert group.heartbeat(2, 10.0) == [PeerJoined(2)]
+    assert group.heartbeat(2, 12.0) == []
+    assert group.alive == (1, 2)
+    assert not group.is_complete
+    assert group.heartbeat(3, 13.0) == [PeerJoined(3)]
+    assert group.is_complete
+    assert group.next_poll_s() == 17.0
+    assert group.poll(16.9) == []
+    assert group.poll(17.0) == [PeerLost(2)]
+    assert group.poll(17.0) == []
+    assert group.heartbeat(2, 30.0) == [PeerJoined(2)]
+    assert group.poll(30.0) == [PeerLost(3)]
+
+
+def test_strangers_and_ourselves_are_not_peers() -> None:
+    group = Group(THREE, 1)
+    assert group.heartbeat(9, 0.0) == []
+    assert group.map_state(9, NEW, 0.0) == []
+    assert group.heartbeat(1, 0.0) == []
+    assert group.alive == (1,)
+    assert group.state_of(9) is None
+
+
+def test_the_coordinator_is_the_leader_until_it_was_heard_and_lost() -> None:
+    group = Group(THREE, 3)
+    assert group.coordinator == 1  # never heard: waited for
+    group.heartbeat(2, 0.0)
+    group.heartbeat(1, 0.0)
+    group.heartbeat(2, 4.0)
+    group.poll(5.0)
+    assert group.coordinator == 2
+    group.poll(9.0)
+    assert group.coordinator == 3
+    assert group.is_coordinator
+    group.heartbeat(1, 10.0)
+    assert group.coordinator == 1
+
+
+def test_a_configured_leader_coordinates() -> None:
+    group = Group(SwarmOptions(members=(1, 2, 3), leader=2), 1)
+    assert (group.leader, group.coordinator) == (2, 2)
+
+
+def test_who_lacks_the_newest_map() -> None:
+    group = Group(THREE, 1)
+    group.heartbeat(2, 0.0)
+    assert group.lacking() == ()  # there is none yet
+    group.set_own_state(OLD)
+    assert group.lacking() == (2,)
+    assert group.map_state(3, OLD, 0.0) == [PeerJoined(3)]
+    group.map_state(2, OLD, 0.0)
+    assert group.lacking() == ()
+    group.set_own_state(NEW)
+    assert group.newest_revision == NEW.revision
+    assert group.lacking() == (2, 3)
+    group.map_state(3, NEW, 1.0)
+    assert group.holders(NEW.revision) == (1, 3)
+    assert group.lacking() == (2,)
+    group.poll(5.0)  # 2 is lost
+    assert group.lacking() == ()
+    group.map_state(3, NEW, 5.0)
+    group.heartbeat(2, 6.0)  # back, perhaps restarted: what it had is not believed
+    assert group.state_of(2) is None
+    assert group.lacking() == (2,)
+
+
+def test_a_member_knows_the_newest_map_from_the_coordinator() -> None:
+    group = Group(THREE, 3)
+    group.set_own_state(OLD)
+    assert group.newest_revision == b""
+    group.map_state(1, NEW, 0.0)
+    assert group.newest_revision == NEW.revision
+    assert group.lacking() == (3,)
+
+
+@given(st.lists(st.tuples(st.integers(1, 4), st.floats(0.0, 100.0)), max_size=40))
+def test_whatever_is_heard_alive_is_who_was_heard_lately(heard: list[tuple[int, float]]) -> None:
+    group = Group(THREE, 1)
+    events = []
+    now_s = 0.0
+    latest: dict[int, float] = {}
+    for peer, at_s in sorted(heard, key=lambda pair: pair[1]):
+        now_s = at_s
+        events += group.poll(now_s)
+        events += group.heartbeat(peer, now_s)
+        latest[peer] = now_s
+    lately = {peer for peer, at_s in latest.items() if peer in (2, 3) and now_s < at_s + 5.0}
+    assert set(group.alive) == lately | {1}
+    for peer in (2, 3):
+        kinds = [type(event) for event in events if event.peer == peer]
+        expected = [PeerJoined, PeerLost] * len(kinds)
+        assert kinds == expected[: len(kinds)]

@@ -1,0 +1,57 @@
+"""Hypothesis strategies for whatever fits one TUNNEL payload."""
+
+from __future__ import annotations
+
+from hypothesis import strategies as st
+
+from vcl_companion.wire.chunks import CHUNK_DATA_BYTES, MAX_CHUNKS, Chunk, Reply, TransferStatus
+from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
+
+_tags = st.integers(0, (1 << 32) - 1)
+_asks = st.integers(1, 127)
+
+chunks = st.builds(
+    Chunk,
+    tag=_tags,
+    index=st.integers(0, MAX_CHUNKS - 1),
+    ask=st.integers(0, 127),
+    data=st.binary(min_size=1, max_size=CHUNK_DATA_BYTES),
+)
+
+
+@st.composite
+def _windows(draw: st.DrawFn) -> TransferStatus:
+    cuts = draw(
+        st.lists(st.integers(0, MAX_CHUNKS), min_size=2, max_size=40, unique=True).map(sorted)
+    )
+    pairs = tuple(zip(cuts[1:-1:2], cuts[2:-1:2], strict=False))
+    return TransferStatus(draw(_tags), Reply.RECEIVING, draw(_asks), cuts[0], cuts[-1], pairs[:18])
+
+
+statuses = st.one_of(
+    _windows(),
+    st.builds(
+        TransferStatus,
+        tag=_tags,
+        reply=st.just(Reply.COMPLETE),
+        ask=_asks,
+        digest=st.binary(min_size=8, max_size=8),
+    ),
+    st.builds(
+        TransferStatus,
+        tag=_tags,
+        reply=st.sampled_from([Reply.BUSY, Reply.TOO_LARGE, Reply.CORRUPT]),
+        ask=_asks,
+    ),
+)
+
+_request_ids = st.integers(0, (1 << 32) - 1)
+_revisions = st.one_of(st.just(b""), st.binary(min_size=8, max_size=8))
+
+messages = st.one_of(
+    st.builds(FrameRequest, _request_ids, st.floats(0.0, 3600.0)),
+    st.builds(MapState, _revisions, st.integers(0, 32_768), st.booleans()),
+    st.builds(MapRefused.because, _request_ids, st.text()),
+)
+
+payload_values = st.one_of(chunks, statuses, messages)

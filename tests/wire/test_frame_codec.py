@@ -1,0 +1,102 @@
+"""The frame answer's bytes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.wire.golden import assert_golden
+from tests.wire.samples import CAMERAS, random_pose, small_frame
+from vcl_companion.errors import WireError
+from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame, encode_frame
+from vcl_companion.wire.header import PROTOCOL_VERSION, BlobKind, VersionMismatchError
+
+
+@st.composite
+def _frames(draw: st.DrawFn) -> FrameAnswer:
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    return FrameAnswer(
+        drone_id=draw(st.integers(1, 255)),
+        request_id=draw(st.integers(0, 2**32 - 1)),
+        captured_at_ns=draw(st.integers(0, 2**63 - 1)),
+        frame_age_s=draw(st.floats(0.0, 3600.0)),
+        ned_from_body=random_pose(rng).quaternion() if draw(st.booleans()) else None,
+        body_from_cam=random_pose(rng, 0.5),
+        camera=draw(st.sampled_from(CAMERAS)),
+        image_bytes=draw(st.binary(min_size=1, max_size=400)),
+    )
+
+
+def assert_frames_close(a: FrameAnswer, b: FrameAnswer) -> None:
+    for name in ("drone_id", "request_id", "captured_at_ns", "frame_age_s", "camera"):
+        assert getattr(a, name) == getattr(b, name)
+    assert a.image_bytes == b.image_bytes
+    assert np.array_equal(a.body_from_cam.translation, b.body_from_cam.translation)
+    assert np.abs(a.body_from_cam.rotation - b.body_from_cam.rotation).max() < 5e-9
+    assert (a.ned_from_body is None) == (b.ned_from_body is None)
+    if a.ned_from_body is not None and b.ned_from_body is not None:
+        assert abs(abs(float(a.ned_from_body @ b.ned_from_body)) - 1.0) < 1e-12
+
+
+def test_golden_bytes() -> None:
+    data = encode_frame(small_frame())
+    assert_golden("frame_answer", data)
+    assert_frames_close(decode_frame(data), small_frame())
+    without = encode_frame(replace(small_frame(), ned_from_body=None))
+    assert_golden("frame_answer_no_attitude", without)
+    assert decode_frame(without).ned_from_body is None
+
+
+@given(_frames())
+def test_round_trip_keeps_the_frame_and_the_bytes(frame: FrameAnswer) -> None:
+    data = encode_frame(frame)
+    decoded = decode_frame(data)
+    assert_frames_close(frame, decoded)
+    assert encode_frame(decoded) == data
+
+
+@given(_frames(), st.data())
+@settings(max_examples=150)
+def test_mutated_frames_are_a_frame_with_exactly_these_bytes_or_a_wire_error(
+    frame: FrameAnswer, data: st.DataObject
+) -> None:
+    mutated = bytearray(encode_frame(frame))
+    for _ in range(data.draw(st.integers(1, 3))):
+        mutated[data.draw(st.integers(0, len(mutated) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        decoded = decode_frame(bytes(mutated))
+    except WireError:
+        return
+    assert encode_frame(decoded) == bytes(mutated)
+
+
+@given(st.binary(max_size=200), st.booleans())
+def test_any_bytes_are_a_wire_error(body: bytes, with_header: bool) -> None:
+    header = bytes([PROTOCOL_VERSION, BlobKind.FRAME_ANSWER]) if with_header else b""
+    with pytest.raises(WireError):
+        decode_frame(header + body)
+
+
+def test_another_version_is_recognised() -> None:
+    data = encode_frame(small_frame())
+    with pytest.raises(VersionMismatchError):
+        decode_frame(bytes([PROTOCOL_VERSION + 1]) + data[1:])
+
+
+def test_frames_out_of_bounds_are_refused() -> None:
+    frame = small_frame()
+    with pytest.raises(ValueError, match="unit quaternion"):
+        replace(frame, ned_from_body=np.array([1.0, 0.0, 0.0, 0.1]))
+    with pytest.raises(ValueError, match="unit quaternion"):
+        replace(frame, ned_from_body=np.eye(3))
+    with pytest.raises(ValueError, match="age"):
+        replace(frame, frame_age_s=float("inf"))
+    with pytest.raises(ValueError, match="drone 0"):
+        replace(frame, drone_id=0)
+    for image in (b"", bytes(1024 * 1024 + 1)):
+        with pytest.raises(ValueError, match="an image of"):
+            encode_frame(replace(frame, image_bytes=image))

@@ -1,0 +1,298 @@
+"""Blobs on their way in, from many peers: reassembly, integrity, quotas.
+
+A receiver only ever answers: it sends nothing that a chunk did not ask for. It
+keeps an unfinished blob for a while, so that a sender that comes back (after a
+gap, or restarted) goes on where it was, and remembers finished ones, so that
+late chunks do not begin them anew.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+from vcl_companion.errors import WireError
+from vcl_companion.swarm.reassembly import CHUNK_COST_BYTES, FIXED_COST_BYTES, Incoming
+from vcl_companion.swarm.transfer_options import TransferOptions
+from vcl_companion.wire.chunks import (
+    CHUNK_DATA_BYTES,
+    Chunk,
+    Descriptor,
+    Reply,
+    TransferStatus,
+    decode_descriptor,
+    receiving_statuses,
+)
+from vcl_companion.wire.header import BlobKind
+
+_MAX_DAMAGED = 3  # whole blobs with a wrong hash before a transfer is refused
+_MAX_STATUSES = 8  # payloads in one answer
+_MAX_SETTLED = 1024  # remembered finished transfers, of all peers
+_MAX_ANSWERS = 256  # answers owed at one time, to all peers
+_QUIET_SHARE = 0.1  # of the status interval: no chunk for this long, and an answer goes out
+_IDLE_SHARE = 0.25  # of the give-up time: silent for this long, and memory may be taken
+
+_Key = tuple[int, int]  # peer, tag
+
+
+@dataclass(frozen=True)
+class BlobReceived:
+    """A peer's blob arrived whole and undamaged."""
+
+    peer: int
+    kind: BlobKind
+    blob: bytes
+
+
+@dataclass(frozen=True)
+class ReceptionAbandoned:
+    """A blob that a peer began will not be finished; ``kind`` is None if it never said."""
+
+    peer: int
+    kind: BlobKind | None
+    reason: str
+
+
+ReceptionEvent = BlobReceived | ReceptionAbandoned
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """A status owed to a peer."""
+
+    due_s: float
+    asked_at_s: float
+    ask: int
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """How a transfer ended here, for chunks that still come."""
+
+    reply: Reply
+    digest: bytes
+    at_s: float
+
+
+class Receptions:
+    """All blobs on their way in."""
+
+    def __init__(self, options: TransferOptions) -> None:
+        self._options = options
+        self._incoming: dict[_Key, Incoming] = {}
+        self._settled: dict[_Key, _Settled] = {}
+        self._answers: dict[_Key, _Answer] = {}
+
+    @property
+    def memory_bytes(self) -> int:
+        """Memory that unfinished blobs take."""
+        return sum(incoming.cost_bytes for incoming in self._incoming.values())
+
+    def receive(self, peer: int, chunk: Chunk, now_s: float) -> list[ReceptionEvent]:
+        """Take in a chunk; return what ended by it."""
+        key = (peer, chunk.tag)
+        settled = self._settled.get(key)
+        if settled is not None and now_s - settled.at_s < self._options.keep_partial_s:
+            if chunk.ask:
+                self._owe(key, _Answer(now_s, now_s, chunk.ask))
+            return []
+        self._settled.pop(key, None)
+        events: list[ReceptionEvent] = []
+        incoming = self._open(key, now_s, events)
+        if incoming is not None:
+            self._store(key, incoming, chunk, now_s, events)
+        if key in self._settled:
+            self._owe(key, _Answer(now_s, now_s, max(chunk.ask, 1)))  # news: no need to be asked
+        else:
+            self._note_ask(key, chunk, now_s)
+        return events
+
+    def answers(self, now_s: float) -> list[tuple[int, TransferStatus]]:
+        """Return the (peer, status) that are due; what is returned counts as sent."""
+        out: list[tuple[int, TransferStatus]] = []
+        for key in [key for key, answer in self._answers.items() if answer.due_s <= now_s]:
+            answer = self._answers.pop(key)
+            out += [(key[0], status) for status in self._statuses(key, answer.ask)]
+            if key in self._incoming:
+                self._incoming[key].answered_at_s = now_s
+        return out
+
+    def expire(self, now_s: float) -> list[ReceptionEvent]:
+        """Drop unfinished blobs that nobody goes on with."""
+        keep_s = self._options.keep_partial_s
+        old = [key for key, i in self._incoming.items() if now_s >= i.heard_at_s + keep_s]
+        return [self._abandon(key, f"nothing came for {keep_s:g} s") for key in old]
+
+    def next_s(self) -> float:
+        """Return when an answer is due or a blob expires; infinity for never."""
+        due = [answer.due_s for answer in self._answers.values()]
+        keep_s = self._options.keep_partial_s
+        expiries = [incoming.heard_at_s + keep_s for incoming in self._incoming.values()]
+        return min(due + expiries, default=math.inf)
+
+    def _open(self, key: _Key, now_s: float, events: list[ReceptionEvent]) -> Incoming | None:
+        """Return the unfinished blob of a chunk, a new one if need be; None if too many are."""
+        incoming = self._incoming.get(key)
+        if incoming is not None:
+            return incoming
+        of_peer = [other for other in self._incoming if other[0] == key[0]]
+        if len(of_peer) >= self._options.max_incoming_per_peer and not self._evict(
+            of_peer, now_s, events
+        ):
+            return None
+        if not self._fits(key, FIXED_COST_BYTES, now_s, events):
+            return None
+        incoming = Incoming(now_s)
+        self._incoming[key] = incoming
+        return incoming
+
+    def _store(
+        self,
+        key: _Key,
+        incoming: Incoming,
+        chunk: Chunk,
+        now_s: float,
+        events: list[ReceptionEvent],
+    ) -> None:
+        """Keep a chunk of an unfinished blob; finish the blob if that was the last."""
+        descriptor = incoming.descriptor
+        if descriptor is None and chunk.index == 0:
+            descriptor = _descriptor_of(chunk)
+            if descriptor is None:
+                return
+            if descriptor.length_bytes > self._options.max_blob_bytes:
+                events.append(self._refuse(key, Reply.TOO_LARGE, "longer than allowed", now_s))
+                return
+        # Without a descriptor nobody knows which chunk is the last, the only one that is short.
+        full = CHUNK_DATA_BYTES if descriptor is None else descriptor.chunk_bytes(chunk.index)
+        if len(chunk.data) != full:
+            return
+        room = incoming.room_for(chunk.index + 1) if descriptor is None else descriptor.n_chunks
+        more_bytes = (room - len(incoming.arrived)) * CHUNK_COST_BYTES
+        incoming.starved = not self._fits(key, more_bytes, now_s, events)
+        if incoming.starved:
+            return
+        if descriptor is not None and incoming.end > descriptor.n_chunks:
+            incoming.begin_again()
+        incoming.descriptor = descriptor
+        incoming.make_room(room)
+        incoming.put(chunk)
+        incoming.heard_at_s = now_s
+        if descriptor is not None and incoming.n_arrived == descriptor.n_chunks:
+            self._finish(key, incoming, descriptor, now_s, events)
+
+    def _finish(
+        self,
+        key: _Key,
+        incoming: Incoming,
+        descriptor: Descriptor,
+        now_s: float,
+        events: list[ReceptionEvent],
+    ) -> None:
+        """Hand out a whole blob, or begin it again if its hash is wrong."""
+        blob = descriptor.blob_of(incoming.stream)
+        if blob is not None:
+            self._settle(key, _Settled(Reply.COMPLETE, descriptor.short_digest, now_s))
+            events.append(BlobReceived(key[0], descriptor.kind, blob))
+            return
+        incoming.begin_again()
+        if incoming.n_damaged >= _MAX_DAMAGED:
+            events.append(self._refuse(key, Reply.CORRUPT, "damaged every time", now_s))
+
+    def _fits(self, key: _Key, more_bytes: int, now_s: float, events: list[ReceptionEvent]) -> bool:
+        """Return whether the quotas grant a blob more, if need be by dropping idle ones."""
+        if more_bytes <= 0:
+            return True
+        quota_bytes = self._options.memory_quota_bytes
+        while True:
+            others = [other for other in self._incoming if other != key]
+            of_peer = [other for other in others if other[0] == key[0]]
+            own_bytes = self._cost_bytes([k for k in self._incoming if k == key]) + more_bytes
+            if own_bytes + self._cost_bytes(of_peer) > quota_bytes // 2:
+                evictable = of_peer
+            elif own_bytes + self._cost_bytes(others) > quota_bytes:
+                evictable = others
+            else:
+                return True
+            if not self._evict(evictable, now_s, events):
+                return False
+
+    def _cost_bytes(self, keys: list[_Key]) -> int:
+        """Return the memory that some unfinished blobs take."""
+        return sum(self._incoming[key].cost_bytes for key in keys)
+
+    def _evict(self, keys: list[_Key], now_s: float, events: list[ReceptionEvent]) -> bool:
+        """Drop the one of these unfinished blobs that is idle longest, if it is idle at all."""
+        if not keys:
+            return False
+        idlest = min(keys, key=lambda key: self._incoming[key].heard_at_s)
+        if now_s - self._incoming[idlest].heard_at_s < _IDLE_SHARE * self._options.give_up_s:
+            return False
+        events.append(self._abandon(idlest, "idle, and its memory was needed"))
+        return True
+
+    def _abandon(self, key: _Key, reason: str) -> ReceptionAbandoned:
+        """Drop an unfinished blob."""
+        descriptor = self._incoming.pop(key).descriptor
+        return ReceptionAbandoned(key[0], descriptor.kind if descriptor else None, reason)
+
+    def _refuse(self, key: _Key, reply: Reply, reason: str, now_s: float) -> ReceptionAbandoned:
+        """Drop an unfinished blob and tell its sender not to go on."""
+        event = self._abandon(key, reason)
+        self._settle(key, _Settled(reply, b"", now_s))
+        return event
+
+    def _settle(self, key: _Key, settled: _Settled) -> None:
+        """Remember how a transfer ended, and forget the oldest of too many."""
+        self._incoming.pop(key, None)
+        self._settled[key] = settled
+        while len(self._settled) > _MAX_SETTLED:
+            del self._settled[next(iter(self._settled))]
+
+    def _note_ask(self, key: _Key, chunk: Chunk, now_s: float) -> None:
+        """Owe an answer if the chunk asks, and put it off while chunks still come in.
+
+        Chunks overtake each other: an answer given at once would call those
+        lost that are still on their way. Only a sender that begins (nothing is
+        on its way yet) learns at once what is here already.
+        """
+        owed = self._answers.get(key)
+        if owed is None and not chunk.ask:
+            return
+        interval_s = self._options.status_interval_s
+        asked_at_s = now_s if owed is None else owed.asked_at_s
+        due_s = min(asked_at_s + interval_s, now_s + _QUIET_SHARE * interval_s)
+        incoming = self._incoming.get(key)
+        answered_at_s = -math.inf if incoming is None else incoming.answered_at_s
+        if chunk.ask and chunk.index == 0 and now_s - answered_at_s >= interval_s:
+            due_s = now_s
+        elif owed is not None and owed.due_s <= now_s:
+            due_s = owed.due_s
+        self._owe(key, _Answer(due_s, asked_at_s, chunk.ask or (owed.ask if owed else 1)))
+
+    def _owe(self, key: _Key, answer: _Answer) -> None:
+        """Note an answer; beyond a bound it is left out, and the sender asks again."""
+        if key in self._answers or len(self._answers) < _MAX_ANSWERS:
+            self._answers[key] = answer
+
+    def _statuses(self, key: _Key, ask: int) -> list[TransferStatus]:
+        """Return what there is to say about a transfer."""
+        tag = key[1]
+        settled = self._settled.get(key)
+        if settled is not None:
+            return [TransferStatus(tag, settled.reply, ask, digest=settled.digest)]
+        incoming = self._incoming.get(key)
+        if incoming is None or incoming.starved:
+            return [TransferStatus(tag, Reply.BUSY, ask)]
+        statuses = receiving_statuses(tag, ask, incoming.known_end(), incoming.missing())
+        return list(itertools.islice(statuses, _MAX_STATUSES))
+
+
+def _descriptor_of(chunk: Chunk) -> Descriptor | None:
+    """Return the descriptor in a stream's first chunk; None if it was damaged on the way."""
+    try:
+        descriptor = decode_descriptor(chunk.data)
+    except WireError:
+        return None
+    return descriptor if descriptor.tag == chunk.tag else None

@@ -1,0 +1,142 @@
+"""The answer to a frame request: one drone's frame with all a peer needs to use it."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+from vcl_companion.errors import WireError
+from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.wire.header import (
+    HEADER_BYTES,
+    MAX_BLOB_BYTES,
+    BlobKind,
+    decode_header,
+    encode_header,
+)
+from vcl_companion.wire.messages import check_age, check_request_id
+from vcl_companion.wire.pose_codec import (
+    encode_camera,
+    encode_image,
+    encode_pose,
+    encode_rotation,
+    take_camera,
+    take_image,
+    take_pose,
+    take_rotation,
+)
+from vcl_companion.wire.reader import Reader
+
+# After version and kind
+# | 2  | u8  | drone (system id), not 0                                       |
+# | 3  | u32 | request id                                                     |
+# | 7  | u64 | captured at, ns, the sender's own clock, below 2^63            |
+# | 15 | f64 | age of the frame when it was sent, s                           |
+# | 23 | u8  | 1: an attitude follows, 0: none                                |
+# | 24 | rotation ned_from_body if so, pose body_from_cam, camera, image: see pose_codec |
+_HEAD = struct.Struct("<BIQdB")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameAnswer:
+    """One frame of one drone.
+
+    Attributes:
+        drone_id: system id of the drone that took it.
+        request_id: of the request this answers.
+        captured_at_ns: mid-exposure, on that drone's own clock.
+        frame_age_s: how old the frame was when it was sent.
+        ned_from_body: (4,) unit quaternion w x y z from its autopilot at that
+            instant, or None if it had none.
+        body_from_cam: its camera's mounting.
+        camera: its camera's intrinsics.
+        image_bytes: the encoded image (WebP).
+    """
+
+    drone_id: int
+    request_id: int
+    captured_at_ns: int
+    frame_age_s: float
+    ned_from_body: Array | None
+    body_from_cam: Pose
+    camera: Camera
+    image_bytes: bytes
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.drone_id <= 255 or not 0 <= self.captured_at_ns < 1 << 63:
+            raise ValueError(f"a frame of drone {self.drone_id} at {self.captured_at_ns} ns")
+        check_request_id(self.request_id)
+        check_age(self.frame_age_s)
+        if self.ned_from_body is None:
+            return
+        quaternion = np.array(self.ned_from_body, dtype=np.float64)
+        if quaternion.shape != (4,) or not math.isclose(
+            float(np.linalg.norm(quaternion)), 1.0, abs_tol=1e-6
+        ):
+            raise ValueError(f"FrameAnswer.ned_from_body is no unit quaternion: {quaternion}")
+        quaternion.flags.writeable = False
+        object.__setattr__(self, "ned_from_body", quaternion)
+
+
+def encode_frame(frame: FrameAnswer) -> bytes:
+    """Return the bytes of a frame answer; its attitude is rounded to 1e-9 rad.
+
+    Raises:
+        ValueError: the image or the camera is larger than peers accept.
+    """
+    attitude = b"" if frame.ned_from_body is None else encode_rotation(frame.ned_from_body)
+    return b"".join(
+        [
+            encode_header(BlobKind.FRAME_ANSWER),
+            _HEAD.pack(
+                frame.drone_id,
+                frame.request_id,
+                frame.captured_at_ns,
+                frame.frame_age_s,
+                frame.ned_from_body is not None,
+            ),
+            attitude,
+            encode_pose(frame.body_from_cam),
+            encode_camera(frame.camera),
+            encode_image(frame.image_bytes),
+        ]
+    )
+
+
+def decode_frame(data: bytes) -> FrameAnswer:
+    """Return the frame answer of encoded bytes; the image stays encoded.
+
+    Raises:
+        WireError: the bytes are not a frame answer, or one out of bounds.
+    """
+    if len(data) > MAX_BLOB_BYTES:
+        raise WireError(f"a frame answer of {len(data)} bytes, at most {MAX_BLOB_BYTES}")
+    kind = decode_header(data)
+    if kind != BlobKind.FRAME_ANSWER:
+        raise WireError(f"not a frame answer: blob kind {kind}")
+    reader = Reader(data, "frame answer", HEADER_BYTES)
+    drone_id, request_id, captured_at_ns, age_s, has_attitude = reader.unpack(_HEAD)
+    if has_attitude > 1:
+        raise WireError(f"frame answer: attitude flag {has_attitude}")
+    attitude = take_rotation(reader) if has_attitude else None
+    body_from_cam, camera = take_pose(reader), take_camera(reader)
+    image_bytes = take_image(reader)
+    reader.finish()
+    try:
+        return FrameAnswer(
+            drone_id,
+            request_id,
+            captured_at_ns,
+            age_s,
+            attitude,
+            body_from_cam,
+            camera,
+            image_bytes,
+        )
+    except ValueError as error:
+        raise WireError(f"frame answer: {error}") from None

@@ -1,0 +1,252 @@
+"""The shared map (IV-C) as bytes, and the revision that names them.
+
+Every accepted map has exactly one byte string: ``encode_map(decode_map(b)) ==
+b``. Points lie on a grid of 2^-16 m and pixels on one of 2^-6 px (both finer
+than what they were measured to); poses, cameras and images are kept exactly.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import struct
+
+import numpy as np
+
+from vcl_companion.errors import WireError
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
+from vcl_companion.wire.columns import (
+    Integers,
+    encode_bits,
+    encode_column,
+    take_bits,
+    take_column,
+)
+from vcl_companion.wire.header import (
+    HEADER_BYTES,
+    MAX_BLOB_BYTES,
+    BlobKind,
+    decode_header,
+    encode_header,
+)
+from vcl_companion.wire.pose_codec import (
+    MAX_COORDINATE_M,
+    encode_camera,
+    encode_image,
+    encode_pose,
+    take_camera,
+    take_image,
+    take_pose,
+)
+from vcl_companion.wire.reader import Reader
+
+REVISION_BYTES = 8
+MAX_KEYFRAMES = 256
+MAX_LANDMARKS = 32_768
+MAX_CELLS = 1 << 20  # landmarks times keyframes: bounds the observation table
+MAX_DISTANCES = 256
+
+# Head, after version and kind
+# | 2  | u8      | detectors: 1 akaze + 2 sift + 4 orb     |
+# | 3  | u8      | bytes of the parent revision: 0 or 8    |
+# | 4  | u16     | keyframes V, at least 1                 |
+# | 6  | u16     | known distances D                       |
+# | 8  | u32     | landmarks N                             |
+# | 12 | f64     | pixel noise, px                         |
+# | 20 | 8 bytes | parent revision, zeros when there is none |
+_HEAD = struct.Struct("<BBHHId8s")
+_DETECTORS = ("akaze", "sift", "orb")  # bit by bit
+
+# D times | 0 | 2 x u16 | keyframes a, b | then | 4 | 2 x f64 | distance, sigma, m |
+_DISTANCE = struct.Struct("<2H2d")
+
+# V times | 0 | u8 | drone | 1 | u64 | captured at, ns | then two poses (world_from_body,
+# body_from_cam), camera, image: see pose_codec
+_KEYFRAME = struct.Struct("<BQ")
+
+# Then three columns x, y, z of N values in steps of 2^-16 m, then for every keyframe N bits
+# (seen there) and two columns u, v of its seen landmarks in steps of 2^-6 px from pixel -1.
+_STEPS_PER_M = 1 << 16
+_STEPS_PER_PX = 1 << 6
+_MARGIN_PX = 1.0  # a subpixel peak may lie a little outside of the image
+
+
+def revision_of(data: bytes) -> bytes:
+    """Return the 8 bytes that name a map: the first of the SHA-256 of its encoded bytes."""
+    return hashlib.sha256(data).digest()[:REVISION_BYTES]
+
+
+def encode_map(landmark_map: LandmarkMap) -> bytes:
+    """Return the bytes of a map; points and pixels are rounded to their grids.
+
+    Raises:
+        ValueError: the map breaks a bound that peers hold every map to.
+    """
+    m = landmark_map
+    n_landmarks, n_keyframes = len(m.points_world), len(m.keyframes)
+    _check_counts(n_landmarks, n_keyframes, len(m.distances))
+    detectors = sum(1 << bit for bit, name in enumerate(_DETECTORS) if name in m.detectors)
+    if not m.detectors or not set(m.detectors) <= set(_DETECTORS):
+        raise ValueError(f"detectors must be some of {', '.join(_DETECTORS)}: {m.detectors}")
+    if len(m.parent) not in (0, REVISION_BYTES):
+        raise ValueError(f"a parent revision has 0 or {REVISION_BYTES} bytes: {m.parent!r}")
+    if n_landmarks and np.abs(m.points_world).max() > MAX_COORDINATE_M:
+        raise ValueError(f"a landmark lies further than {MAX_COORDINATE_M:.0f} m from the origin")
+    parts = [
+        encode_header(BlobKind.MAP),
+        _HEAD.pack(
+            detectors,
+            len(m.parent),
+            n_keyframes,
+            len(m.distances),
+            n_landmarks,
+            m.pixel_noise_px,
+            m.parent,
+        ),
+    ]
+    for distance in m.distances:
+        _check_distance(distance)
+        parts.append(
+            _DISTANCE.pack(
+                distance.keyframe_a, distance.keyframe_b, distance.distance_m, distance.sigma_m
+            )
+        )
+    parts += [_encode_keyframe(keyframe) for keyframe in m.keyframes]
+    points = np.rint(m.points_world * _STEPS_PER_M).astype(np.int64)
+    parts += [encode_column(points[:, axis]) for axis in range(3)]
+    for i, keyframe in enumerate(m.keyframes):
+        parts += _encode_observations(keyframe, m.observed_px[:, i])
+    data = b"".join(parts)
+    if len(data) > MAX_BLOB_BYTES:
+        raise ValueError(f"a map of {len(data)} bytes, at most {MAX_BLOB_BYTES}")
+    return data
+
+
+def decode_map(data: bytes) -> LandmarkMap:
+    """Return the map of encoded bytes.
+
+    Raises:
+        WireError: the bytes are not a map, or one out of bounds.
+    """
+    if len(data) > MAX_BLOB_BYTES:
+        raise WireError(f"a map of {len(data)} bytes, at most {MAX_BLOB_BYTES}")
+    kind = decode_header(data)
+    if kind != BlobKind.MAP:
+        raise WireError(f"not a map: blob kind {kind}")
+    reader = Reader(data, "map", HEADER_BYTES)
+    detectors, n_parent, n_keyframes, n_distances, n_landmarks, noise_px, parent = reader.unpack(
+        _HEAD
+    )
+    if not 0 < detectors < 1 << len(_DETECTORS):
+        raise WireError(f"map: unknown detectors {detectors:#x}")
+    if n_parent not in (0, REVISION_BYTES) or parent[n_parent:].strip(b"\0"):
+        raise WireError("map: malformed parent revision")
+    try:
+        _check_counts(n_landmarks, n_keyframes, n_distances)
+        distances = tuple(KnownDistance(*reader.unpack(_DISTANCE)) for _ in range(n_distances))
+        for distance in distances:
+            _check_distance(distance)
+        keyframes = tuple(_take_keyframe(reader) for _ in range(n_keyframes))
+        points = np.stack([take_column(reader, n_landmarks) for _ in range(3)], axis=1)
+        if n_landmarks and np.abs(points).max() > MAX_COORDINATE_M * _STEPS_PER_M:
+            raise WireError("map: a landmark lies out of range")
+        observed_px = np.full((n_landmarks, n_keyframes, 2), np.nan)
+        for i, keyframe in enumerate(keyframes):
+            observed_px[:, i] = _take_observations(reader, keyframe, n_landmarks)
+        reader.finish()
+        return LandmarkMap(
+            keyframes=keyframes,
+            points_world=points / _STEPS_PER_M,
+            observed_px=observed_px,
+            pixel_noise_px=noise_px,
+            detectors=tuple(n for bit, n in enumerate(_DETECTORS) if detectors >> bit & 1),
+            distances=distances,
+            parent=parent[:n_parent],
+        )
+    except ValueError as error:
+        raise WireError(f"map: {error}") from None
+
+
+def _encode_keyframe(keyframe: Keyframe) -> bytes:
+    """Return the bytes of one keyframe without its observations."""
+    if not 1 <= keyframe.drone_id <= 255 or not 0 <= keyframe.captured_at_ns < 1 << 63:
+        raise ValueError(
+            f"a keyframe of drone {keyframe.drone_id} captured at {keyframe.captured_at_ns} ns"
+        )
+    return (
+        _KEYFRAME.pack(keyframe.drone_id, keyframe.captured_at_ns)
+        + encode_pose(keyframe.world_from_body)
+        + encode_pose(keyframe.body_from_cam)
+        + encode_camera(keyframe.camera)
+        + encode_image(keyframe.image_bytes)
+    )
+
+
+def _take_keyframe(reader: Reader) -> Keyframe:
+    """Return the keyframe that comes next."""
+    drone_id, captured_at_ns = reader.unpack(_KEYFRAME)
+    if drone_id == 0 or captured_at_ns >= 1 << 63:
+        raise WireError(f"map: keyframe of drone {drone_id} at {captured_at_ns} ns")
+    return Keyframe(
+        drone_id,
+        captured_at_ns,
+        take_pose(reader),
+        take_pose(reader),
+        take_camera(reader),
+        take_image(reader),
+    )
+
+
+def _encode_observations(keyframe: Keyframe, observed_px: Array) -> list[bytes]:
+    """Return mask and columns of what one keyframe saw; (N, 2) px, NaN where not seen."""
+    finite = np.isfinite(observed_px)
+    seen = finite[:, 0] & finite[:, 1]
+    if (finite[:, 0] != finite[:, 1]).any():
+        raise ValueError("an observation has only one of its two coordinates")
+    steps = np.rint((observed_px[seen] + _MARGIN_PX) * _STEPS_PER_PX)
+    if len(steps) and (steps.min() < 0 or (steps > _largest_steps(keyframe)).any()):
+        raise ValueError("an observation lies outside of its image")
+    columns = steps.astype(np.int64)
+    return [encode_bits(seen), encode_column(columns[:, 0]), encode_column(columns[:, 1])]
+
+
+def _take_observations(reader: Reader, keyframe: Keyframe, n_landmarks: int) -> Array:
+    """Return the (N, 2) pixels of one keyframe that come next, NaN where not seen."""
+    seen = take_bits(reader, n_landmarks)
+    n_seen = int(seen.sum())
+    steps = np.stack([take_column(reader, n_seen), take_column(reader, n_seen)], axis=1)
+    if n_seen and (steps.min() < 0 or (steps > _largest_steps(keyframe)).any()):
+        raise WireError("map: an observation lies outside of its image")
+    observed_px = np.full((n_landmarks, 2), np.nan)
+    observed_px[seen] = steps / _STEPS_PER_PX - _MARGIN_PX
+    return observed_px
+
+
+def _largest_steps(keyframe: Keyframe) -> Integers:
+    """Return the (2,) largest value of the columns u, v."""
+    camera = keyframe.camera
+    size_px = np.array([camera.width_px, camera.height_px], dtype=np.int64)
+    return (size_px + int(_MARGIN_PX)) * _STEPS_PER_PX
+
+
+def _check_counts(n_landmarks: int, n_keyframes: int, n_distances: int) -> None:
+    """Raise ValueError for counts out of bounds, before any work is done for them."""
+    if not 1 <= n_keyframes <= MAX_KEYFRAMES:
+        raise ValueError(f"{n_keyframes} keyframes, allowed 1 to {MAX_KEYFRAMES}")
+    if n_landmarks > MAX_LANDMARKS or n_landmarks * n_keyframes > MAX_CELLS:
+        raise ValueError(f"{n_landmarks} landmarks in {n_keyframes} keyframes are too many")
+    if n_distances > MAX_DISTANCES:
+        raise ValueError(f"{n_distances} known distances, at most {MAX_DISTANCES}")
+
+
+def _check_distance(distance: KnownDistance) -> None:
+    """Raise ValueError for a distance that cannot give a scale."""
+    numbers = (distance.distance_m, distance.sigma_m)
+    if not (
+        all(map(math.isfinite, numbers))
+        and 0 < distance.distance_m <= 2 * MAX_COORDINATE_M
+        and distance.sigma_m >= 0
+        and distance.keyframe_a != distance.keyframe_b
+    ):
+        raise ValueError(f"not a known distance: {distance}")

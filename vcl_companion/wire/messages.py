@@ -1,0 +1,157 @@
+"""What fits one payload: requests and states between peers."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+from vcl_companion.errors import WireError
+from vcl_companion.wire.map_codec import MAX_LANDMARKS, REVISION_BYTES
+from vcl_companion.wire.reader import Reader
+
+MAX_AGE_S = 3600.0
+MAX_REASON_BYTES = 90
+
+# FrameRequest body
+# | 0 | u32 | request id                                            |
+# | 4 | f64 | age of the wanted instant when the request was sent, s |
+_FRAME_REQUEST = struct.Struct("<Id")
+
+# MapState body
+# | 0 | u8      | bytes of the revision: 0 (no map) or 8   |
+# | 1 | 8 bytes | revision, zeros when there is none       |
+# | 9 | u32     | landmarks of that map                    |
+# | 13 | u8     | 1: localized in it now, 0: not           |
+_MAP_STATE = struct.Struct("<B8sIB")
+
+# MapRefused body
+# | 0 | u32  | request id                                |
+# | 4 | rest | reason, printable UTF-8, 1 to 90 bytes    |
+_MAP_REFUSED = struct.Struct("<I")
+
+
+@dataclass(frozen=True)
+class FrameRequest:
+    """Asks a peer for its frame of one instant.
+
+    Attributes:
+        request_id: chosen by who asks, echoed in the answer.
+        frame_age_s: how long before the sending of this request the instant was.
+    """
+
+    request_id: int
+    frame_age_s: float
+
+    def __post_init__(self) -> None:
+        check_request_id(self.request_id)
+        check_age(self.frame_age_s)
+
+
+@dataclass(frozen=True)
+class MapState:
+    """Which map a drone flies on.
+
+    Attributes:
+        revision: 8 bytes (``revision_of``), or empty without a map.
+        n_landmarks: of that map.
+        localized: whether it localizes in it now.
+    """
+
+    revision: bytes
+    n_landmarks: int
+    localized: bool
+
+    def __post_init__(self) -> None:
+        if len(self.revision) not in (0, REVISION_BYTES):
+            raise ValueError(f"a revision has 0 or {REVISION_BYTES} bytes: {self.revision!r}")
+        if not 0 <= self.n_landmarks <= MAX_LANDMARKS:
+            raise ValueError(f"a map of {self.n_landmarks} landmarks, at most {MAX_LANDMARKS}")
+
+
+@dataclass(frozen=True)
+class MapRefused:
+    """Why no map came of a request.
+
+    Attributes:
+        request_id: of the request.
+        reason: one printable line of at most 90 bytes; ``because`` makes any text one.
+    """
+
+    request_id: int
+    reason: str
+
+    def __post_init__(self) -> None:
+        check_request_id(self.request_id)
+        if not self.reason.isprintable():
+            raise ValueError("a reason must be printable")
+        if not 1 <= len(self.reason.encode("utf-8")) <= MAX_REASON_BYTES:
+            raise ValueError(f"a reason has 1 to {MAX_REASON_BYTES} bytes: {self.reason!r}")
+
+    @classmethod
+    def because(cls, request_id: int, reason: str) -> MapRefused:
+        """Make the message of any text: shortened to fit, what cannot be printed replaced."""
+        text = "".join(c if c.isprintable() else " " for c in reason).strip() or "no reason given"
+        fitting = text.encode("utf-8")[:MAX_REASON_BYTES].decode("utf-8", errors="ignore")
+        return cls(request_id, fitting)
+
+
+def encode_frame_request(message: FrameRequest) -> bytes:
+    """Return the body of a frame request."""
+    return _FRAME_REQUEST.pack(message.request_id, message.frame_age_s)
+
+
+def decode_frame_request(body: bytes) -> FrameRequest:
+    """Return the frame request of a body, or raise WireError."""
+    reader = Reader(body, "frame request")
+    request_id, frame_age_s = reader.unpack(_FRAME_REQUEST)
+    reader.finish()
+    try:
+        return FrameRequest(request_id, frame_age_s)
+    except ValueError as error:
+        raise WireError(f"frame request: {error}") from None
+
+
+def encode_map_state(message: MapState) -> bytes:
+    """Return the body of a map state."""
+    return _MAP_STATE.pack(
+        len(message.revision), message.revision, message.n_landmarks, message.localized
+    )
+
+
+def decode_map_state(body: bytes) -> MapState:
+    """Return the map state of a body, or raise WireError."""
+    reader = Reader(body, "map state")
+    n_revision, revision, n_landmarks, localized = reader.unpack(_MAP_STATE)
+    reader.finish()
+    if n_revision > REVISION_BYTES or revision[n_revision:].strip(b"\0") or localized > 1:
+        raise WireError("map state: malformed")
+    try:
+        return MapState(revision[:n_revision], n_landmarks, bool(localized))
+    except ValueError as error:
+        raise WireError(f"map state: {error}") from None
+
+
+def encode_map_refused(message: MapRefused) -> bytes:
+    """Return the body of a refusal."""
+    return _MAP_REFUSED.pack(message.request_id) + message.reason.encode("utf-8")
+
+
+def decode_map_refused(body: bytes) -> MapRefused:
+    """Return the refusal of a body, or raise WireError."""
+    (request_id,) = Reader(body, "map refused").unpack(_MAP_REFUSED)
+    try:
+        return MapRefused(request_id, body[_MAP_REFUSED.size :].decode("utf-8"))
+    except ValueError as error:  # UnicodeDecodeError is one
+        raise WireError(f"map refused: {error}") from None
+
+
+def check_request_id(request_id: int) -> None:
+    """Raise ValueError unless the id fits its 32 bits."""
+    if not 0 <= request_id < 1 << 32:
+        raise ValueError(f"a request id has 32 bits: {request_id}")
+
+
+def check_age(age_s: float) -> None:
+    """Raise ValueError unless an age is one: finite, not negative, at most an hour."""
+    if not 0.0 <= age_s <= MAX_AGE_S:
+        raise ValueError(f"an age of 0 to {MAX_AGE_S:.0f} s: {age_s}")
