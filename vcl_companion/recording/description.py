@@ -1,0 +1,134 @@
+"""``recording.toml``: what a recording says of itself; every key is optional."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+from vcl_companion.errors import RecordingError
+
+_KEYS = ("name", "frame_rate_hz", "leader", "known_distance")
+_PAIR_FORM = 'known_distance must be ["mav0", "mav1"], ["mav0", "mav1", metres] or a list of such'
+
+
+@dataclass(frozen=True)
+class KnownPair:
+    """Two drones whose distance at the start is known (assumption 2 of the method).
+
+    Attributes:
+        a, b: the drones' names.
+        distance_m: between the bodies; None: the harness takes it from the truth.
+    """
+
+    a: str
+    b: str
+    distance_m: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.a == self.b:
+            raise ValueError(f"known_distance names {self.a!r} twice")
+        if self.distance_m is not None and not 0.0 < self.distance_m < 1e6:
+            raise ValueError("known_distance must be above 0 and below 1e6 metres")
+
+
+@dataclass(frozen=True)
+class Description:
+    """The keys of ``recording.toml``; None where it is silent."""
+
+    name: str | None = None
+    frame_rate_hz: float | None = None
+    leader: str | None = None
+    known_distances: tuple[KnownPair, ...] = ()
+
+
+def read_description(path: Path) -> Description:
+    """Read ``recording.toml``; an absent file says nothing.
+
+    Raises:
+        RecordingError: it is not TOML, or a key is unknown or of the wrong type.
+    """
+    try:
+        table = tomllib.loads(path.read_text("utf-8"))
+    except FileNotFoundError:
+        return Description()
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise RecordingError(f"{path}: not TOML ({' '.join(str(error).split())})") from None
+    except (ValueError, RecursionError):
+        raise RecordingError(f"{path}: not TOML text") from None
+    for key in table:
+        if key not in _KEYS:
+            nearest = difflib.get_close_matches(key, _KEYS, n=1, cutoff=0.0)[0]
+            raise RecordingError(f"{path}: unknown key {key!r}; the nearest is {nearest!r}")
+    for key in ("name", "leader"):
+        if key in table and not (isinstance(table[key], str) and table[key].strip()):
+            raise RecordingError(f"{path}: {key} must be a text that is not empty")
+    rate_hz = table.get("frame_rate_hz")
+    if rate_hz is not None and not (_is_number(rate_hz) and 0.0 < rate_hz < 1e6):
+        raise RecordingError(f"{path}: frame_rate_hz must be a positive number below 1e6")
+    return Description(
+        name=table.get("name"),
+        frame_rate_hz=None if rate_hz is None else float(rate_hz),
+        leader=table.get("leader"),
+        known_distances=_known_pairs(path, table.get("known_distance", [])),
+    )
+
+
+def format_description(description: Description) -> str:
+    """Return the text of a ``recording.toml``."""
+    lines = []
+    if description.name is not None:
+        lines.append(f"name = {_toml_string(description.name)}")
+    if description.frame_rate_hz is not None:
+        lines.append(f"frame_rate_hz = {float(description.frame_rate_hz)!r}")
+    if description.leader is not None:
+        lines.append(f"leader = {_toml_string(description.leader)}")
+    pairs = []
+    for pair in description.known_distances:
+        cells = [_toml_string(pair.a), _toml_string(pair.b)]
+        if pair.distance_m is not None:
+            cells.append(repr(float(pair.distance_m)))
+        pairs.append(f"[{', '.join(cells)}]")
+    if len(pairs) == 1:
+        lines.append(f"known_distance = {pairs[0]}")
+    elif pairs:
+        lines.append(f"known_distance = [{', '.join(pairs)}]")
+    return "".join(line + "\n" for line in lines)
+
+
+def _known_pairs(path: Path, value: object) -> tuple[KnownPair, ...]:
+    if not isinstance(value, list):
+        raise RecordingError(f"{path}: {_PAIR_FORM}")
+    entries = value if all(isinstance(entry, list) for entry in value) else [value]
+    pairs = []
+    for entry in entries:
+        if len(entry) not in (2, 3) or not all(isinstance(name, str) for name in entry[:2]):
+            raise RecordingError(f"{path}: {_PAIR_FORM}")
+        distance = entry[2] if len(entry) == 3 else None
+        if distance is not None and not _is_number(distance):
+            raise RecordingError(f"{path}: {_PAIR_FORM}")
+        try:
+            pairs.append(KnownPair(entry[0], entry[1], distance))
+        except ValueError as error:
+            raise RecordingError(f"{path}: {error}") from None
+    return tuple(pairs)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _toml_string(text: str) -> str:
+    """Quote a basic TOML string: backslash, quote and control characters escaped."""
+    out = []
+    for character in text:
+        if character in '"\\':
+            out.append("\\" + character)
+        elif ord(character) < 0x20 or ord(character) == 0x7F:
+            out.append(f"\\u{ord(character):04x}")
+        else:
+            out.append(character)
+    return '"' + "".join(out) + '"'
