@@ -1,0 +1,1 @@
+"""Where frames come from: a device, a simulator's stream, a recording."""
