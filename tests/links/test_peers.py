@@ -1,0 +1,182 @@
+"""Peer links among themselves, and against strangers, on loopback."""
+
+import asyncio
+import socket
+
+import pytest
+
+from tests.links import wire
+from tests.links.running import running, udp
+from vcl_companion.errors import ConfigError
+from vcl_companion.links.mavlink import Tunnel
+from vcl_companion.links.peers import PeerLink, PeerOptions
+
+MEMBERS = frozenset({1, 2, 3})
+PAYLOAD_TYPE = 40000
+
+
+def free_ports(n: int) -> list[int]:
+    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(n)]
+    try:
+        for s in sockets:
+            s.bind(("127.0.0.1", 0))
+        return [int(s.getsockname()[1]) for s in sockets]
+    finally:
+        for s in sockets:
+            s.close()
+
+
+class Drone:
+    """A peer link and what it heard."""
+
+    def __init__(self, options: PeerOptions, system_id: int) -> None:
+        self.tunnels: asyncio.Queue[Tunnel] = asyncio.Queue()
+        self.beats: asyncio.Queue[int] = asyncio.Queue()
+        self.link = PeerLink(
+            options, system_id, MEMBERS, self.tunnels.put_nowait, self.beats.put_nowait
+        )
+
+    async def hears(self, *systems: int) -> None:
+        missing = set(systems)
+        while missing:
+            missing.discard(await self.beats.get())
+
+
+def unicast(n: int) -> list[Drone]:
+    addresses = [f"127.0.0.1:{port}" for port in free_ports(n)]
+    return [
+        Drone(PeerOptions(me, tuple(a for a in addresses if a != me)), k + 1)
+        for k, me in enumerate(addresses)
+    ]
+
+
+def test_unicast_reaches_all_or_the_one_addressed() -> None:
+    async def scenario() -> None:
+        drones = one, two, three = unicast(3)
+        async with running(*(drone.link.run() for drone in drones)):
+            await one.hears(2, 3)
+            one.link.send(PAYLOAD_TYPE, b"to all")
+            for drone in (two, three):
+                got = await drone.tunnels.get()
+                assert got == Tunnel(1, 197, 0, PAYLOAD_TYPE, b"to all")
+            before = one.link.counters.bytes_out
+            one.link.send(PAYLOAD_TYPE, b"to three" * 16, target_system=3)
+            # Its address is known from its heartbeat: one datagram, and only there.
+            assert one.link.counters.bytes_out - before == 145
+            assert await three.tunnels.get() == Tunnel(1, 197, 3, PAYLOAD_TYPE, b"to three" * 16)
+            assert two.tunnels.empty()
+            assert two.link.counters.refused.get("tunnel for another system", 0) == 0
+
+    asyncio.run(scenario())
+
+
+def test_one_addressed_to_an_unknown_address_goes_to_all_and_is_ignored_by_others() -> None:
+    async def scenario() -> None:
+        one, two, _ = unicast(3)
+        async with running(one.link.run(), two.link.run()):
+            await two.hears(1)
+            await one.hears(2)
+            two.link.send(PAYLOAD_TYPE, b"to three", target_system=3)
+            two.link.send(PAYLOAD_TYPE, b"to one", target_system=1)
+            assert (await one.tunnels.get()).payload == b"to one"
+            assert one.link.counters.refused["tunnel for another system"] == 1
+
+    asyncio.run(scenario())
+
+
+def test_strangers_and_nonsense_are_counted_and_not_heard() -> None:
+    async def scenario() -> None:
+        port, other = free_ports(2)
+        drone = Drone(PeerOptions(f"127.0.0.1:{port}", (f"127.0.0.1:{other}",)), 1)
+        async with udp(other) as side, running(drone.link.run()):
+            await side.got.get()
+            for data in (
+                wire.tunnel(b"x", system=9),
+                wire.tunnel(b"x", system=1),
+                wire.tunnel(b"x", system=2, component=1),
+                wire.tunnel(b"x", system=2, target=3),
+                wire.tunnel(b"x", system=2, length=200),
+                wire.heartbeat(2, 1),
+                wire.packed(wire.TIMESYNC, 0, 1, system=2, component=197),
+                b"\xfd\x09",
+                wire.tunnel(b"good", system=2) + wire.heartbeat(2, 197),
+            ):
+                side.transport.sendto(data, ("127.0.0.1", port))
+            assert await drone.beats.get() == 2
+            assert (await drone.tunnels.get()).payload == b"good"
+            assert drone.tunnels.empty()
+            assert drone.link.counters.refused == {
+                "not a member": 1,
+                "own echo": 1,
+                "not a companion": 2,
+                "tunnel for another system": 1,
+                "tunnel length is a lie": 1,
+                "not a peer's message": 1,
+                "truncated": 1,
+            }
+
+    asyncio.run(scenario())
+
+
+def test_a_stranger_that_claims_to_be_a_member_is_never_answered() -> None:
+    async def scenario() -> None:
+        port, other = free_ports(2)
+        drone = Drone(PeerOptions(f"127.0.0.1:{port}", (f"127.0.0.1:{other}",)), 1)
+        async with udp(other) as side, udp() as liar, running(drone.link.run()):
+            await side.got.get()
+            liar.transport.sendto(wire.heartbeat(2, 197), ("127.0.0.1", port))
+            await drone.hears(2)
+            drone.link.send(PAYLOAD_TYPE, b"secret", target_system=2)
+            (seen,) = wire.read((await side.got.get())[0])
+            assert seen.message_id == wire.TUNNEL
+            assert liar.got.empty()
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.parametrize("group", ["127.255.255.255", "239.255.42.99"])
+def test_a_group_address_reaches_everybody_and_the_own_echo_is_ignored(group: str) -> None:
+    async def scenario() -> None:
+        (port,) = free_ports(1)
+        listen = "127.0.0.1" if group.startswith("239") else group
+        options = PeerOptions(f"{listen}:{port}", (f"{group}:{port}",))
+        drones = one, two, three = [Drone(options, k) for k in (1, 2, 3)]
+        async with running(*(drone.link.run() for drone in drones)):
+            await one.hears(2, 3)
+            await two.hears(1, 3)
+            one.link.send(PAYLOAD_TYPE, b"to all")
+            two.link.send(PAYLOAD_TYPE, b"to three", target_system=3)
+            assert (await two.tunnels.get()).payload == b"to all"
+            assert {(await three.tunnels.get()).payload for _ in range(2)} == {
+                b"to all",
+                b"to three",
+            }
+            assert one.tunnels.empty()
+            assert one.link.counters.refused["own echo"] >= 2
+
+    asyncio.run(scenario())
+
+
+def test_a_burst_of_a_map_is_not_lost_while_the_receiver_is_busy() -> None:
+    async def scenario() -> None:
+        one, two = unicast(2)
+        async with running(one.link.run(), two.link.run()):
+            await two.hears(1)
+            for k in range(150):
+                one.link.send(PAYLOAD_TYPE, k.to_bytes(2, "big") * 64)
+            got = [await two.tunnels.get() for _ in range(150)]
+            assert [t.payload for t in got] == [k.to_bytes(2, "big") * 64 for k in range(150)]
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.parametrize(
+    ("listen", "to"),
+    [("0.0.0.0", ()), ("drone:14650", ()), ("0.0.0.0:1", ("::1:14650",)),
+     ("[::]:1", ("[::1]:14650",)), ("0.0.0.0:1", ("127.0.0.1:0",)),
+     ("0.0.0.0:1", ("239.0.0.1:1", "127.0.0.1:1")), ("0.0.0.0:1", ("239.0.0.1:2",)),
+     ("0.0.0.0:1", ("127.0.0.1:2", "127.0.0.1:2"))],
+)  # fmt: skip
+def test_wrong_peer_addresses_are_refused(listen: str, to: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigError):
+        PeerOptions(listen, to)

@@ -1,0 +1,130 @@
+"""MAVLink frames made and read by hand, from the published layouts, without pymavlink."""
+
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+# message id: CRC_EXTRA, https://mavlink.io/en/messages/ardupilotmega.html
+HEARTBEAT, ATTITUDE, ATTITUDE_QUATERNION, COMMAND_LONG, COMMAND_ACK = 0, 30, 31, 76, 77
+VISION_POSITION_ESTIMATE, TIMESYNC, STATUSTEXT, TUNNEL = 102, 111, 253, 385
+CRC_EXTRA = {
+    HEARTBEAT: 50,
+    ATTITUDE: 39,
+    ATTITUDE_QUATERNION: 246,
+    COMMAND_LONG: 152,
+    COMMAND_ACK: 143,
+    VISION_POSITION_ESTIMATE: 158,
+    TIMESYNC: 34,
+    STATUSTEXT: 83,
+    TUNNEL: 147,
+}
+# Fields on the wire stand by falling size, extensions last.
+LAYOUT = {
+    HEARTBEAT: struct.Struct("<IBBBBB"),  # custom_mode type autopilot base_mode status version
+    ATTITUDE: struct.Struct("<I6f"),
+    ATTITUDE_QUATERNION: struct.Struct("<I7f4f"),
+    COMMAND_LONG: struct.Struct("<7fHBBB"),
+    COMMAND_ACK: struct.Struct("<HBBiBB"),
+    VISION_POSITION_ESTIMATE: struct.Struct("<Q6f21fB"),
+    TIMESYNC: struct.Struct("<qq"),
+    STATUSTEXT: struct.Struct("<B50sHB"),
+    TUNNEL: struct.Struct("<HBBB128s"),
+}
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A frame that was read."""
+
+    sequence: int
+    system: int
+    component: int
+    message_id: int
+    fields: tuple[Any, ...]
+
+
+def crc(data: bytes) -> int:
+    """CRC-16/MCRF4XX."""
+    value = 0xFFFF
+    for byte in data:
+        low = (byte ^ value) & 0xFF
+        low = (low ^ (low << 4)) & 0xFF
+        value = (value >> 8) ^ (low << 8) ^ (low << 3) ^ (low >> 4)
+    return value & 0xFFFF
+
+
+def frame(
+    message_id: int,
+    payload: bytes,
+    *,
+    system: int = 1,
+    component: int = 1,
+    sequence: int = 0,
+    flags: int = 0,
+    crc_extra: int | None = None,
+) -> bytes:
+    """A MAVLink 2 frame, its payload cut at trailing zeros."""
+    payload = payload.rstrip(b"\0") or payload[:1]
+    head = bytes([len(payload), flags, 0, sequence, system, component])
+    body = head + message_id.to_bytes(3, "little") + payload
+    extra = CRC_EXTRA[message_id] if crc_extra is None else crc_extra
+    signature = bytes(13) if flags & 1 else b""
+    return b"\xfd" + body + crc(body + bytes([extra])).to_bytes(2, "little") + signature
+
+
+def frame_1(message_id: int, payload: bytes, system: int = 1, component: int = 1) -> bytes:
+    """A MAVLink 1 frame."""
+    body = bytes([len(payload), 0, system, component, message_id]) + payload
+    checksum = crc(body + bytes([CRC_EXTRA[message_id]]))
+    return b"\xfe" + body + checksum.to_bytes(2, "little")
+
+
+def packed(
+    message_id: int, *fields: int | float | bytes, system: int = 1, component: int = 1
+) -> bytes:
+    """A MAVLink 2 frame of a message's fields in wire order."""
+    payload = LAYOUT[message_id].pack(*fields)
+    return frame(message_id, payload, system=system, component=component)
+
+
+def heartbeat(system: int = 1, component: int = 1) -> bytes:
+    return packed(HEARTBEAT, 4, 2, 3, 1, 4, 3, system=system, component=component)
+
+
+def attitude_quaternion(time_boot_ms: int, quaternion: tuple[float, float, float, float]) -> bytes:
+    return packed(ATTITUDE_QUATERNION, time_boot_ms, *quaternion, 0, 0, 0, 0, 0, 0, 0)
+
+
+def tunnel(
+    payload: bytes,
+    *,
+    system: int,
+    component: int = 197,
+    target: int = 0,
+    target_component: int = 0,
+    length: int | None = None,
+    payload_type: int = 40000,
+) -> bytes:
+    n = len(payload) if length is None else length
+    return packed(
+        TUNNEL, payload_type, target, target_component, n, payload, system=system,
+        component=component,
+    )  # fmt: skip
+
+
+def read(data: bytes) -> list[Seen]:
+    """Read whole, correct MAVLink 2 frames; anything else is an assertion error."""
+    out = []
+    while data:
+        assert data[0] == 0xFD
+        n = data[1]
+        assert data[2] == 0
+        body, checksum = data[1 : 10 + n], data[10 + n : 12 + n]
+        message_id = int.from_bytes(data[7:10], "little")
+        expected = crc(body + bytes([CRC_EXTRA[message_id]]))
+        assert int.from_bytes(checksum, "little") == expected
+        layout = LAYOUT[message_id]
+        payload = data[10 : 10 + n].ljust(layout.size, b"\0")
+        out.append(Seen(data[4], data[5], data[6], message_id, layout.unpack(payload)))
+        data = data[12 + n :]
+    return out

@@ -1,0 +1,129 @@
+"""The autopilot's recent attitudes, and the one at an instant of our clock; no socket, no clock.
+
+An attitude carries the autopilot's milliseconds since its start. They are
+turned into our time only when an attitude is asked for, by the best offset
+known then.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections import deque
+from dataclasses import dataclass
+from typing import Literal
+
+from vcl_companion.geometry.rotation import Array, exp_so3, log_so3
+from vcl_companion.links.mavlink import AttitudeSample
+
+_NS_PER_MS = 1_000_000
+# The stamp is cut off to whole milliseconds: on average the truth is half of one later.
+_CUT_OFF_NS = _NS_PER_MS // 2
+_MAX_SAMPLES = 1024
+# A stamp this much earlier than the last is a restart, less is a datagram overtaken.
+_REBOOT_MS = 1000
+_ARRIVALS = 128
+
+Taken = Literal["taken", "overtaken", "rebooted"]
+
+
+@dataclass(frozen=True, eq=False)
+class Attitude:
+    """Where the body's axes point.
+
+    Attributes:
+        ned_from_body: (3, 3) rotation.
+        at_ns: our clock. It is the instant asked for when samples lie on both
+            sides of it, else the instant of the nearest sample.
+    """
+
+    ned_from_body: Array
+    at_ns: int
+
+    def __post_init__(self) -> None:
+        if self.ned_from_body.shape != (3, 3):
+            raise ValueError(f"an attitude is (3, 3), got {self.ned_from_body.shape}")
+        self.ned_from_body.flags.writeable = False
+
+
+class AttitudeHistory:
+    """The last samples of one message, oldest first.
+
+    Args:
+        latency_ns: from measuring to arriving, used only without TIMESYNC.
+        max_age_ns: how far from the instant asked for a sample may be.
+    """
+
+    def __init__(self, latency_ns: int, max_age_ns: int) -> None:
+        self._latency_ns = latency_ns
+        self._max_age_ns = max_age_ns
+        self._samples: deque[AttitudeSample] = deque(maxlen=_MAX_SAMPLES)
+        self._arrivals: deque[int] = deque(maxlen=_ARRIVALS)
+
+    def add(self, sample: AttitudeSample, arrived_at_ns: int) -> Taken:
+        """Take a sample in; one of an autopilot that has restarted clears those before."""
+        taken: Taken = "taken"
+        if self._samples:
+            later_ms = sample.time_boot_ms - self._samples[-1].time_boot_ms
+            if later_ms < -_REBOOT_MS:
+                self.clear()
+                taken = "rebooted"
+            elif later_ms < 0:
+                return "overtaken"
+            elif later_ms == 0:
+                self._samples.pop()
+        self._samples.append(sample)
+        self._arrivals.append(arrived_at_ns - self._measured_ns(sample))
+        return taken
+
+    def clear(self) -> None:
+        """Forget all samples."""
+        self._samples.clear()
+        self._arrivals.clear()
+
+    def offset_by_arrival_ns(self) -> int | None:
+        """Return our clock minus the autopilot's, judged by when samples came, ns.
+
+        The quickest of the last arrivals less the latency; None without samples.
+        """
+        return min(self._arrivals) - self._latency_ns if self._arrivals else None
+
+    def is_near(self, at_ns: int, offset_ns: int) -> bool:
+        """Return whether the stream reaches up to ``at_ns``, but for the allowed age."""
+        return bool(self._samples) and self._newest_ns(offset_ns) >= at_ns - self._max_age_ns
+
+    def covers(self, at_ns: int, offset_ns: int) -> bool:
+        """Return whether a sample at or after ``at_ns`` has come, as far as stamps can tell."""
+        return bool(self._samples) and self._newest_ns(offset_ns) + _CUT_OFF_NS >= at_ns
+
+    def at(self, at_ns: int, offset_ns: int) -> Attitude | None:
+        """Return the attitude at an instant.
+
+        Args:
+            at_ns: our clock.
+            offset_ns: our clock minus the autopilot's.
+
+        Returns:
+            interpolated on the arc between the samples around it, or the nearest
+            sample when all are on one side; None when the nearest is further away
+            than the allowed age.
+        """
+        index = bisect.bisect_left(
+            self._samples, at_ns, key=lambda sample: self._measured_ns(sample) + offset_ns
+        )
+        around = [self._samples[i] for i in (index - 1, index) if 0 <= i < len(self._samples)]
+        times = [self._measured_ns(sample) + offset_ns for sample in around]
+        if not around or min(abs(at_ns - time) for time in times) > self._max_age_ns:
+            return None
+        if len(around) == 1:
+            return Attitude(around[0].ned_from_body, times[0])
+        before, after = (sample.ned_from_body for sample in around)
+        fraction = (at_ns - times[0]) / (times[1] - times[0])
+        return Attitude(before @ exp_so3(fraction * log_so3(before.T @ after)), at_ns)
+
+    def _newest_ns(self, offset_ns: int) -> int:
+        return self._measured_ns(self._samples[-1]) + offset_ns
+
+    @staticmethod
+    def _measured_ns(sample: AttitudeSample) -> int:
+        """Return the likeliest instant of a sample by the autopilot's clock, ns."""
+        return sample.time_boot_ms * _NS_PER_MS + _CUT_OFF_NS

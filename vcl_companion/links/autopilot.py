@@ -1,0 +1,355 @@
+"""The link to the vehicle's own autopilot: attitude in, pose out, clocks, state, texts."""
+
+from __future__ import annotations
+
+import asyncio
+import enum
+import logging
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from vcl_companion.clock import Clock
+from vcl_companion.errors import ConfigError
+from vcl_companion.geometry.pose import Pose, euler_pose_covariance
+from vcl_companion.geometry.rotation import Array, euler_from_matrix
+from vcl_companion.links.attitude import Attitude, AttitudeHistory
+from vcl_companion.links.counters import LinkCounters, LinkTally
+from vcl_companion.links.mavlink import (
+    ATTITUDE_QUATERNION_ID,
+    COMPONENT_AUTOPILOT,
+    COMPONENT_COMPANION,
+    RESULT_ACCEPTED,
+    SET_MESSAGE_INTERVAL,
+    STATUS_TEXT_BYTES,
+    AttitudeSample,
+    Codec,
+    CommandAck,
+    Message,
+    Timesync,
+)
+from vcl_companion.links.reconnect import Address
+from vcl_companion.links.timesync import TimesyncEstimator
+from vcl_companion.links.transport import check_allowed_senders, open_transport, parse_link
+
+_log = logging.getLogger(__name__)
+
+_HEARTBEAT_S = 1.0
+# Questions come quickly until the estimate has enough to choose from.
+_SYNC_FAST_S, _SYNC_SLOW_S = 0.1, 1.0
+_SYNC_ENOUGH = 8
+# After this many unanswered questions (1 s) the autopilot does without TIMESYNC.
+_SYNC_GIVEN_UP = 10
+_STREAM_CHECK_S = 1.0
+_STREAM_LONGEST_PAUSE_S = 16.0
+_MAX_TEXT_BYTES = 8 * STATUS_TEXT_BYTES
+# Rounding leaves a zero variance a little negative; more than this is an error.
+_NEGATIVE_VARIANCE = -1e-9
+_MAX_FLOAT32 = 3.4e38
+
+
+class ServiceState(enum.Enum):
+    """What the heartbeat says of us, as MAV_STATE; STALLED says nothing at all."""
+
+    STARTING = 1
+    STANDBY = 3
+    ACTIVE = 4
+    CRITICAL = 5
+    STALLED = 0
+
+
+class Severity(enum.IntEnum):
+    """MAV_SEVERITY."""
+
+    CRITICAL = 2
+    ERROR = 3
+    WARNING = 4
+    NOTICE = 5
+    INFO = 6
+    DEBUG = 7
+
+
+@dataclass(frozen=True)
+class AutopilotOptions:
+    """How the autopilot is reached and listened to.
+
+    Attributes:
+        link: serial:DEVICE:BAUD, udp:HOST:PORT, udpin:HOST:PORT or tcp:HOST:PORT.
+        allowed_senders: for udpin, addresses or networks that may be the autopilot; empty: any.
+        attitude_rate_hz: rate of ATTITUDE_QUATERNION that we ask for.
+        attitude_latency_s: from measuring to arriving, for an autopilot without TIMESYNC.
+        max_attitude_age_s: how far from a frame's instant an attitude may be.
+    """
+
+    link: str = "serial:/dev/serial0:921600"
+    allowed_senders: tuple[str, ...] = ()
+    attitude_rate_hz: float = 50.0
+    attitude_latency_s: float = 0.01
+    max_attitude_age_s: float = 0.1
+
+    def __post_init__(self) -> None:
+        parse_link(self.link)
+        check_allowed_senders(self.allowed_senders)
+        if not 1.0 <= self.attitude_rate_hz <= 400.0:
+            raise ConfigError(f"attitude_rate_hz: must be in 1..400, got {self.attitude_rate_hz}")
+        if not 0.0 <= self.attitude_latency_s <= 1.0:
+            raise ConfigError(f"attitude_latency_s: must be in 0..1, got {self.attitude_latency_s}")
+        if not 0.0 < self.max_attitude_age_s <= 2.0:
+            raise ConfigError(
+                f"max_attitude_age_s: must be above 0 up to 2, got {self.max_attitude_age_s}"
+            )
+
+
+class AutopilotLink:
+    """Our side of the link to one autopilot; everything happens in the event loop's thread."""
+
+    def __init__(self, options: AutopilotOptions, system_id: int, clock: Clock) -> None:
+        self._options = options
+        self._system_id = system_id
+        self._clock = clock
+        self._tally = LinkTally()
+        self._codec = Codec(system_id, COMPONENT_COMPANION, self._tally)
+        self._transport = open_transport(
+            options.link, self._tally, allowed_senders=options.allowed_senders
+        )
+        latency_ns = round(options.attitude_latency_s * 1e9)
+        max_age_ns = round(options.max_attitude_age_s * 1e9)
+        self._by_quaternion = AttitudeHistory(latency_ns, max_age_ns)
+        self._by_euler = AttitudeHistory(latency_ns, max_age_ns)
+        self._n_quaternions = 0
+        self._sync = TimesyncEstimator()
+        self._asked_at_s = -math.inf
+        self._news = asyncio.Event()
+        self._state = ServiceState.STARTING
+        self._said: tuple[Severity, str] | None = None
+        self._n_long_texts = 0
+
+    @property
+    def counters(self) -> LinkCounters:
+        """What went over the link so far."""
+        return self._tally.snapshot()
+
+    @property
+    def round_trip_s(self) -> float | None:
+        """Shortest recent TIMESYNC round trip, s; None without one."""
+        return self._sync.round_trip_s
+
+    async def run(self) -> None:
+        """Keep the link alive until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._transport.run(self._receive, self._greet))
+            group.create_task(self._heartbeats())
+            group.create_task(self._questions())
+            group.create_task(self._stream_requests())
+
+    async def attitude_at(self, at_ns: int, wait_s: float) -> Attitude | None:
+        """Return the attitude at an instant of our clock.
+
+        Waits until a sample at or after the instant has come, ``wait_s`` at most,
+        then takes what there is: None when nothing lies within the option
+        ``max_attitude_age_s``, or while it is not known yet whose time is whose.
+        """
+        loop = asyncio.get_running_loop()
+        deadline_s = loop.time() + wait_s
+        while True:
+            offset_ns = self._offset_ns(at_ns)
+            if offset_ns is not None and self._history(at_ns, offset_ns).covers(at_ns, offset_ns):
+                break
+            if offset_ns is None:
+                self._ask_if_due(_SYNC_FAST_S)
+            remaining_s = deadline_s - loop.time()
+            if remaining_s <= 0.0:
+                break
+            try:
+                async with asyncio.timeout(remaining_s):
+                    await self._news.wait()
+            except TimeoutError:
+                break
+        # A good moment to ask: in a replay the clocks of all processes stand together now.
+        self._ask_if_due(_SYNC_SLOW_S)
+        if offset_ns is None:
+            return None
+        return self._history(at_ns, offset_ns).at(at_ns, offset_ns)
+
+    def send_pose(
+        self, world_from_body: Pose, covariance: Array, at_ns: int, reset_counter: int
+    ) -> bool:
+        """Send VISION_POSITION_ESTIMATE.
+
+        Args:
+            world_from_body: the pose, world NED-like.
+            covariance: (6, 6) local perturbation (``geometry/pose.py``), m and rad.
+            at_ns: when the picture was taken, our clock.
+            reset_counter: bumped at every real jump of the frame; sent modulo 256.
+
+        Returns:
+            False when the covariance is not finite or has a negative variance:
+            nothing was sent, and it is counted. An autopilot takes partial NaN or
+            a negative variance as an internal error.
+        """
+        if covariance.shape != (6, 6):
+            raise ValueError(f"a pose covariance is (6, 6), got {covariance.shape}")
+        with np.errstate(all="ignore"):
+            sent = euler_pose_covariance(world_from_body, covariance)
+        numbers = np.concatenate([sent.ravel(), world_from_body.translation])
+        if not np.all(np.abs(numbers) < _MAX_FLOAT32):
+            self._tally.refuse("pose not sent: not finite")
+            return False
+        variances = np.diag(sent)
+        if variances.min() < _NEGATIVE_VARIANCE * max(1.0, float(variances.max())):
+            self._tally.refuse("pose not sent: negative variance")
+            return False
+        np.fill_diagonal(sent, np.maximum(variances, 0.0))
+        x_m, y_m, z_m = world_from_body.translation.tolist()
+        self._transport.write(
+            self._codec.vision_position_estimate(
+                at_ns // 1000,
+                (x_m, y_m, z_m),
+                euler_from_matrix(world_from_body.rotation),
+                sent,
+                reset_counter % 256,
+            )
+        )
+        return True
+
+    def set_state(self, state: ServiceState) -> None:
+        """Say from the next heartbeat on how we are."""
+        self._state = state
+
+    def say(self, severity: Severity, text: str) -> None:
+        """Send STATUSTEXT, unless it was the last one said; said again when a link comes back."""
+        if self._said == (severity, text):
+            return
+        self._said = (severity, text)
+        self._send_text(severity, text)
+
+    def _send_text(self, severity: Severity, text: str) -> None:
+        # Ground stations differ in what they make of a character cut in two by a chunk.
+        data = text.encode("ascii", "replace")[:_MAX_TEXT_BYTES]
+        if len(data) <= STATUS_TEXT_BYTES:
+            self._transport.write(self._codec.status_text(severity, data, 0, 0))
+            return
+        self._n_long_texts += 1
+        text_id = (self._n_long_texts - 1) % 65535 + 1
+        # A zero byte ends the text: a last chunk that is full needs an empty one after it.
+        for chunk in range(len(data) // STATUS_TEXT_BYTES + 1):
+            part = data[chunk * STATUS_TEXT_BYTES : (chunk + 1) * STATUS_TEXT_BYTES]
+            self._transport.write(self._codec.status_text(severity, part, text_id, chunk))
+
+    def _history(self, at_ns: int, offset_ns: int) -> AttitudeHistory:
+        if self._by_quaternion.is_near(at_ns, offset_ns):
+            return self._by_quaternion
+        return self._by_euler
+
+    def _offset_ns(self, at_ns: int) -> int | None:
+        """Return our clock minus the autopilot's; None while its answer may still come."""
+        offset_ns = self._sync.offset_ns(at_ns)
+        if offset_ns is None and self._sync.unanswered >= _SYNC_GIVEN_UP:
+            offset_ns = self._by_quaternion.offset_by_arrival_ns()
+            if offset_ns is None:
+                offset_ns = self._by_euler.offset_by_arrival_ns()
+        return offset_ns
+
+    def _receive(self, data: bytes, _: Address | None) -> bool:
+        decode = (
+            self._codec.decode_stream if self._transport.is_stream else self._codec.decode_datagram
+        )
+        accepted = False
+        for message in decode(data):
+            if message.sender_system != self._system_id:
+                self._tally.refuse("another system")
+            elif message.sender_component != COMPONENT_AUTOPILOT:
+                self._tally.refuse("another component")
+            else:
+                accepted = True
+                self._accept(message)
+        return accepted
+
+    def _accept(self, message: Message) -> None:
+        match message:
+            case Timesync(tc1_ns=0, ts1_ns=ts1_ns):
+                # Never 0: that would make a question of the answer.
+                now_ns = max(1, self._clock.now_ns())
+                self._transport.write(self._codec.timesync(now_ns, ts1_ns))
+            case Timesync(tc1_ns=tc1_ns, ts1_ns=ts1_ns):
+                refusal = self._sync.answered(ts1_ns, tc1_ns, self._clock.now_ns())
+                if refusal is not None:
+                    self._tally.refuse(refusal)
+                self._wake()
+            case AttitudeSample():
+                self._take_attitude(message)
+            case CommandAck(command=command, result=result, target_system=target):
+                for_us = target in (0, self._system_id) and command == SET_MESSAGE_INTERVAL
+                if for_us and result != RESULT_ACCEPTED:
+                    _log.warning("the autopilot refuses to stream attitude (result %d)", result)
+
+    def _take_attitude(self, sample: AttitudeSample) -> None:
+        quaternion = sample.source == "quaternion"
+        self._n_quaternions += quaternion
+        history = self._by_quaternion if quaternion else self._by_euler
+        match history.add(sample, self._clock.now_ns()):
+            case "overtaken":
+                self._tally.refuse("attitude overtaken by a later one")
+            case "rebooted":
+                _log.warning("the autopilot has restarted")
+                self._sync.reset()
+                (self._by_euler if quaternion else self._by_quaternion).clear()
+        self._wake()
+
+    def _wake(self) -> None:
+        self._news.set()
+        self._news.clear()
+
+    def _greet(self) -> None:
+        """Make ourselves known on a link that has just come up."""
+        self._beat()
+        if self._clock.now_ns() > 0:
+            self._ask_if_due(0.0)
+        self._request_stream()
+        if self._said is not None:
+            self._send_text(*self._said)
+
+    def _beat(self) -> None:
+        if self._state is not ServiceState.STALLED:
+            self._transport.write(self._codec.heartbeat(self._state.value))
+
+    async def _heartbeats(self) -> None:
+        while True:
+            await asyncio.sleep(_HEARTBEAT_S)
+            self._beat()
+
+    async def _questions(self) -> None:
+        while True:
+            await asyncio.sleep(_SYNC_FAST_S)
+            settled = self._sync.n_exchanges >= _SYNC_ENOUGH
+            hopeless = self._sync.unanswered >= _SYNC_GIVEN_UP
+            # A clock that has not been told the time yet has nothing to compare.
+            if self._clock.now_ns() > 0:
+                self._ask_if_due(_SYNC_SLOW_S if settled or hopeless else _SYNC_FAST_S)
+
+    def _ask_if_due(self, every_s: float) -> None:
+        now_s = asyncio.get_running_loop().time()
+        if now_s - self._asked_at_s < every_s:
+            return
+        self._asked_at_s = now_s
+        self._transport.write(self._codec.timesync(0, self._sync.ask(self._clock.now_ns())))
+
+    def _request_stream(self) -> None:
+        interval_us = round(1e6 / self._options.attitude_rate_hz)
+        self._transport.write(
+            self._codec.set_message_interval(self._system_id, ATTITUDE_QUATERNION_ID, interval_us)
+        )
+
+    async def _stream_requests(self) -> None:
+        """Ask for the stream while less than half of it comes, ever less often."""
+        pause_s = _STREAM_CHECK_S
+        while True:
+            n_before = self._n_quaternions
+            await asyncio.sleep(pause_s)
+            wanted = 0.5 * self._options.attitude_rate_hz * pause_s
+            if self._n_quaternions - n_before >= wanted:
+                pause_s = _STREAM_CHECK_S
+                continue
+            self._request_stream()
+            pause_s = min(2.0 * pause_s, _STREAM_LONGEST_PAUSE_S)

@@ -1,0 +1,368 @@
+"""MAVLink 2: bytes to typed messages and back; the only module that knows pymavlink.
+
+Frame, little endian (https://mavlink.io/en/guide/serialization.html):
+
+    0      magic 0xFD
+    1      payload length n (trailing zeros of a payload are not sent)
+    2      incompatibility flags: bit 0 = signed, any other = not for us
+    3      compatibility flags
+    4      sequence
+    5, 6   system id, component id of the sender
+    7..9   message id
+    10     payload, n bytes
+    10+n   CRC-16/MCRF4XX over bytes 1.. and one byte that stands for the message's layout
+    12+n   signature, 13 bytes, when signed
+
+The dialect is ``ardupilotmega``: it contains ``common``, and the EKF_STATUS_REPORT
+of ArduPilot that ``common`` has not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from vcl_companion.geometry.rotation import Array, matrix_from_euler, matrix_from_quaternion
+from vcl_companion.links.counters import LinkTally
+
+COMPONENT_AUTOPILOT = 1
+COMPONENT_COMPANION = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+MAX_TUNNEL_BYTES = 128
+STATUS_TEXT_BYTES = 50
+SET_MESSAGE_INTERVAL = 511
+ATTITUDE_QUATERNION_ID = 31
+RESULT_ACCEPTED = 0
+
+_MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
+_OVERHEAD_1, _OVERHEAD_2 = 8, 12
+_SIGNED = 0x01
+_SIGNATURE_BYTES = 13
+_QUATERNION_NORM_TOLERANCE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Message:
+    """A message with its sender."""
+
+    sender_system: int
+    sender_component: int
+
+
+@dataclass(frozen=True)
+class Heartbeat(Message):
+    """Somebody is there: ``vehicle_type`` MAV_TYPE, ``autopilot`` MAV_AUTOPILOT, MAV_STATE."""
+
+    vehicle_type: int
+    autopilot: int
+    base_mode: int
+    custom_mode: int
+    system_status: int
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudeSample(Message):
+    """An attitude by the autopilot's own clock.
+
+    Attributes:
+        time_boot_ms: milliseconds since the autopilot's start, cut off, not rounded.
+        ned_from_body: (3, 3) rotation.
+        source: the message that it came in.
+    """
+
+    time_boot_ms: int
+    ned_from_body: Array
+    source: Literal["quaternion", "euler"]
+
+    def __post_init__(self) -> None:
+        if self.ned_from_body.shape != (3, 3):
+            raise ValueError(f"an attitude is (3, 3), got {self.ned_from_body.shape}")
+        self.ned_from_body.flags.writeable = False
+
+
+@dataclass(frozen=True)
+class Timesync(Message):
+    """A question (``tc1_ns`` 0) or the answer to the one that was asked at ``ts1_ns``."""
+
+    tc1_ns: int
+    ts1_ns: int
+
+
+@dataclass(frozen=True)
+class Tunnel(Message):
+    """An opaque payload of at most 128 bytes; ``target_system`` 0 is everybody."""
+
+    target_system: int
+    payload_type: int
+    payload: bytes
+
+
+@dataclass(frozen=True)
+class StatusText(Message):
+    """One chunk of a text; ``text_id`` 0 means it is the only one."""
+
+    severity: int
+    text: str
+    text_id: int
+    chunk: int
+
+
+@dataclass(frozen=True)
+class CommandLong(Message):
+    """A command with its seven parameters."""
+
+    target_system: int
+    target_component: int
+    command: int
+    confirmation: int
+    parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class CommandAck(Message):
+    """What became of a command: ``result`` MAV_RESULT."""
+
+    command: int
+    result: int
+    target_system: int
+    target_component: int
+
+
+class Codec:
+    """One link's side of MAVLink: counts its own frames, and keeps the rest of a stream.
+
+    Bytes that are not what they should be never raise; they are counted by
+    reason in the tally. At most one unfinished frame (280 bytes) is kept.
+    """
+
+    def __init__(self, system_id: int, component_id: int, tally: LinkTally) -> None:
+        self._mav = dialect.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+        self._tally = tally
+        self._rest = b""
+
+    def decode_stream(self, data: bytes) -> list[Message]:
+        """Return the messages that ``data`` completes, after what came before it."""
+        messages, self._rest = self._decode(self._rest + data)
+        return messages
+
+    def decode_datagram(self, data: bytes) -> list[Message]:
+        """Return the messages in one datagram, whatever came before it."""
+        messages, rest = self._decode(data)
+        if rest:
+            self._tally.refuse("truncated")
+        return messages
+
+    def _decode(self, data: bytes) -> tuple[list[Message], bytes]:
+        """Return messages and the unfinished frame at the end.
+
+        After a wrong checksum the search goes on at the next byte, so that a
+        magic number within garbage cannot swallow true messages.
+        """
+        messages: list[Message] = []
+        at = 0
+        while at < len(data):
+            magic = data[at]
+            if magic not in (_MAGIC_1, _MAGIC_2):
+                next_at = _next_magic(data, at)
+                self._tally.refuse("garbage bytes", next_at - at)
+                at = next_at
+                continue
+            if len(data) - at < 3:
+                return messages, data[at:]
+            flags = data[at + 2] if magic == _MAGIC_2 else 0
+            if flags & ~_SIGNED:
+                self._tally.refuse("unknown incompatibility flags")
+                at += 1
+                continue
+            overhead = _OVERHEAD_2 if magic == _MAGIC_2 else _OVERHEAD_1
+            end = at + overhead + data[at + 1] + (_SIGNATURE_BYTES if flags else 0)
+            if end > len(data):
+                return messages, data[at:]
+            message, consumed = self._frame(data[at:end], data[end : end + 1])
+            if message is not None:
+                messages.append(message)
+            at = end if consumed else at + 1
+        return messages, b""
+
+    def _frame(self, frame: bytes, following: bytes) -> tuple[Message | None, bool]:
+        """Return a whole frame's message, if wanted, and whether it was a frame at all."""
+        old = frame[0] == _MAGIC_1
+        message_id = frame[5] if old else int.from_bytes(frame[7:10], "little")
+        layout = dialect.mavlink_map.get(message_id)
+        if layout is None:
+            # Its checksum cannot be judged. Taken as whole when a frame follows, so that
+            # nobody can hide a message for us in one that routers do not know either.
+            whole = following in (b"", bytes([_MAGIC_1]), bytes([_MAGIC_2]))
+            self._tally.refuse("unknown message" if whole else "garbage bytes")
+            return None, whole
+        signature = _SIGNATURE_BYTES if not old and frame[2] & _SIGNED else 0
+        body_end = len(frame) - 2 - signature
+        checksum = dialect.x25crc(frame[1:body_end] + bytes([layout.crc_extra])).crc
+        if checksum != int.from_bytes(frame[body_end : body_end + 2], "little"):
+            self._tally.refuse("wrong checksum")
+            return None, False
+        if old:
+            self._tally.refuse("MAVLink 1")
+            return None, True
+        self._tally.messages_in += 1
+        read = _READERS.get(message_id)
+        if read is None:
+            return None, True
+        # A layout's payload, cut or with unknown extensions, is padded or cut to its size.
+        decoded = self._mav.decode(bytearray(frame))
+        message = read(decoded, (frame[5], frame[6]))
+        if isinstance(message, str):
+            self._tally.refuse(message)
+            return None, True
+        return message, True
+
+    def _pack(self, message: Any) -> bytes:
+        frame = bytes(message.pack(self._mav))
+        self._mav.seq = (self._mav.seq + 1) % 256
+        self._tally.messages_out += 1
+        return frame
+
+    def heartbeat(self, system_status: int) -> bytes:
+        """Return a companion's HEARTBEAT with a MAV_STATE."""
+        return self._pack(
+            dialect.MAVLink_heartbeat_message(
+                dialect.MAV_TYPE_ONBOARD_CONTROLLER,
+                dialect.MAV_AUTOPILOT_INVALID,
+                0,
+                0,
+                system_status,
+                3,
+            )
+        )
+
+    def timesync(self, tc1_ns: int, ts1_ns: int) -> bytes:
+        """Return a TIMESYNC, a question when ``tc1_ns`` is 0."""
+        return self._pack(dialect.MAVLink_timesync_message(tc1_ns, ts1_ns))
+
+    def tunnel(self, target_system: int, payload_type: int, payload: bytes) -> bytes:
+        """Return a TUNNEL to another companion, or to all (0).
+
+        Raises:
+            ValueError: the payload is longer than 128 bytes.
+        """
+        if len(payload) > MAX_TUNNEL_BYTES:
+            raise ValueError(f"a TUNNEL takes {MAX_TUNNEL_BYTES} bytes, got {len(payload)}")
+        return self._pack(
+            dialect.MAVLink_tunnel_message(
+                target_system,
+                COMPONENT_COMPANION if target_system else 0,
+                payload_type,
+                len(payload),
+                payload.ljust(MAX_TUNNEL_BYTES, b"\0"),
+            )
+        )
+
+    def status_text(self, severity: int, text: bytes, text_id: int, chunk: int) -> bytes:
+        """Return one chunk of at most 50 bytes of a STATUSTEXT."""
+        return self._pack(dialect.MAVLink_statustext_message(severity, text, text_id, chunk))
+
+    def set_message_interval(self, target_system: int, message_id: int, interval_us: int) -> bytes:
+        """Return the command that asks the autopilot to stream a message."""
+        parameters = (float(message_id), float(interval_us), 0.0, 0.0, 0.0, 0.0, 0.0)
+        return self._pack(
+            dialect.MAVLink_command_long_message(
+                target_system, COMPONENT_AUTOPILOT, SET_MESSAGE_INTERVAL, 0, *parameters
+            )
+        )
+
+    def vision_position_estimate(
+        self,
+        usec: int,
+        position_m: tuple[float, float, float],
+        euler_rad: tuple[float, float, float],
+        covariance: Array,
+        reset_counter: int,
+    ) -> bytes:
+        """Return a VISION_POSITION_ESTIMATE.
+
+        Args:
+            usec: instant of the measurement, us of the clock that answers TIMESYNC.
+            position_m: x y z, NED-like.
+            euler_rad: roll pitch yaw.
+            covariance: (6, 6) of both, m and rad.
+            reset_counter: 0..255.
+        """
+        upper = [float(value) for value in covariance[np.triu_indices(6)]]
+        return self._pack(
+            dialect.MAVLink_vision_position_estimate_message(
+                usec, *position_m, *euler_rad, upper, reset_counter
+            )
+        )
+
+
+def _next_magic(data: bytes, at: int) -> int:
+    found = [i for i in (data.find(_MAGIC_1, at), data.find(_MAGIC_2, at)) if i >= 0]
+    return min(found, default=len(data))
+
+
+_Sender = tuple[int, int]
+
+
+def _heartbeat(m: Any, sender: _Sender) -> Message | str:
+    return Heartbeat(*sender, m.type, m.autopilot, m.base_mode, m.custom_mode, m.system_status)
+
+
+def _timesync(m: Any, sender: _Sender) -> Message | str:
+    return Timesync(*sender, m.tc1, m.ts1)
+
+
+def _attitude(m: Any, sender: _Sender) -> Message | str:
+    angles = (m.roll, m.pitch, m.yaw)
+    if not all(map(math.isfinite, angles)):
+        return "attitude is no rotation"
+    return AttitudeSample(*sender, m.time_boot_ms, matrix_from_euler(*angles), "euler")
+
+
+def _attitude_quaternion(m: Any, sender: _Sender) -> Message | str:
+    quaternion = np.array([m.q1, m.q2, m.q3, m.q4])
+    # Not a number fails this comparison as well.
+    if not abs(float(np.linalg.norm(quaternion)) - 1.0) < _QUATERNION_NORM_TOLERANCE:
+        return "attitude is no rotation"
+    rotation = matrix_from_quaternion(quaternion)
+    return AttitudeSample(*sender, m.time_boot_ms, rotation, "quaternion")
+
+
+def _tunnel(m: Any, sender: _Sender) -> Message | str:
+    if m.payload_length > MAX_TUNNEL_BYTES:
+        return "tunnel length is a lie"
+    if m.target_component not in (0, COMPONENT_COMPANION):
+        return "tunnel for another component"
+    payload = bytes(m.payload[: m.payload_length])
+    return Tunnel(*sender, m.target_system, m.payload_type, payload)
+
+
+def _status_text(m: Any, sender: _Sender) -> Message | str:
+    return StatusText(*sender, m.severity, m.text, m.id, m.chunk_seq)
+
+
+def _command_long(m: Any, sender: _Sender) -> Message | str:
+    parameters = (m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7)
+    return CommandLong(
+        *sender, m.target_system, m.target_component, m.command, m.confirmation, parameters
+    )
+
+
+def _command_ack(m: Any, sender: _Sender) -> Message | str:
+    return CommandAck(*sender, m.command, m.result, m.target_system, m.target_component)
+
+
+# What becomes of each message: a value, or why it is refused.
+_READERS: dict[int, Callable[[Any, _Sender], Message | str]] = {
+    dialect.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
+    dialect.MAVLINK_MSG_ID_TIMESYNC: _timesync,
+    dialect.MAVLINK_MSG_ID_ATTITUDE: _attitude,
+    dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: _attitude_quaternion,
+    dialect.MAVLINK_MSG_ID_TUNNEL: _tunnel,
+    dialect.MAVLINK_MSG_ID_STATUSTEXT: _status_text,
+    dialect.MAVLINK_MSG_ID_COMMAND_LONG: _command_long,
+    dialect.MAVLINK_MSG_ID_COMMAND_ACK: _command_ack,
+}
