@@ -1,0 +1,91 @@
+"""The command ``vcl``."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from vcl_companion.errors import VclError
+
+if TYPE_CHECKING:
+    from vcl_companion.config import LogOptions
+
+# sd-daemon(3): journald reads the severity from the start of a line on standard error.
+_JOURNAL_PRIORITIES = {
+    logging.DEBUG: 7,
+    logging.INFO: 6,
+    logging.WARNING: 4,
+    logging.ERROR: 3,
+    logging.CRITICAL: 2,
+}
+
+
+class _Commands(click.Group):
+    """A group whose expected failures are one line and exit status 2, never a traceback."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except VclError as error:
+            click.echo(f"vcl: {' '.join(str(error).split())}", err=True)
+            ctx.exit(2)
+
+
+class _JournalFormatter(logging.Formatter):
+    """Every line with its severity; the journal adds the time itself."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        prefix = f"<{_JOURNAL_PRIORITIES.get(record.levelno, 6)}>"
+        return "\n".join(prefix + line for line in super().format(record).splitlines())
+
+
+def set_up_logging(options: LogOptions) -> None:
+    """Send messages from ``options.level`` up to standard error, in journald's form under it."""
+    handler = logging.StreamHandler(sys.stderr)
+    if "JOURNAL_STREAM" in os.environ:
+        handler.setFormatter(_JournalFormatter("%(name)s: %(message)s"))
+    else:
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(level=options.level.upper(), handlers=[handler], force=True)
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="vcl-companion", prog_name="vcl")
+def main() -> None:
+    """Collaborative visual localization for drones, as a MAVLink companion service."""
+
+
+@main.command()
+@click.option(
+    "--config",
+    "config_path",
+    required=True,
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="The daemon's configuration (systemd/vcl-companion.toml documents every setting).",
+)
+@click.pass_context
+def run(ctx: click.Context, config_path: Path) -> None:
+    """Run the daemon of one drone until SIGTERM or Ctrl-C.
+
+    Exit status: 0 after a clean end, 2 when the configuration or a device
+    cannot be used, another when it failed.
+    """
+    # Imported here: `vcl --help` need not load OpenCV and pymavlink, and a broken
+    # configuration is told before the daemon's own imports have taken their seconds.
+    from vcl_companion.config import load_config
+
+    config = load_config(config_path)
+    set_up_logging(config.log)
+    from vcl_companion.daemon.assemble import run_daemon
+
+    ctx.exit(run_daemon(config))
+
+
+if __name__ == "__main__":
+    main(prog_name="vcl")

@@ -1,0 +1,1 @@
+"""One drone, one daemon: the parts of the service, put together."""

@@ -1,0 +1,172 @@
+"""The one place where the parts of the daemon are made and joined."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import resource
+import signal
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from vcl_companion.cameras.open import open_camera
+from vcl_companion.cameras.source import CameraSource
+from vcl_companion.clock import Clock, ManualClock, SystemClock
+from vcl_companion.config import Config
+from vcl_companion.daemon import notify
+from vcl_companion.daemon.companion import Companion, CompanionOptions
+from vcl_companion.daemon.exchange import Exchange, ExchangeOptions
+from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.health import Health
+from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.errors import VclError
+from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.peers import PeerLink
+from vcl_companion.recording.sensor import read_sensor
+from vcl_companion.swarm.group import Group
+from vcl_companion.swarm.transfer import Transfers
+
+_log = logging.getLogger(__name__)
+
+
+def run_daemon(config: Config) -> int:
+    """Run one drone's service until SIGTERM, Ctrl-C or the end of the camera's stream.
+
+    Args:
+        config: everything it can be told.
+
+    Returns:
+        Exit status 0: the end was asked for, or the stream was over.
+
+    Raises:
+        VclError: the configuration or a device cannot be used.
+    """
+    # One core per thing: several daemons may share a machine, and OpenCV's own
+    # threads make features depend on their number.
+    cv2.setNumThreads(1)
+    return asyncio.run(_run(config))
+
+
+async def _run(config: Config) -> int:
+    ended = asyncio.Event()
+    loop = asyncio.get_running_loop()
+
+    def end(*_: object) -> None:
+        with suppress(RuntimeError):  # asked for again when the loop is closed already
+            loop.call_soon_threadsafe(ended.set)
+
+    # Not the loop's own handlers: those vanish with it, and a second SIGTERM
+    # would then kill a daemon that is about to end cleanly.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, end)
+    clock: Clock = ManualClock() if config.clock == "camera" else SystemClock()
+    sensor = read_sensor(Path(config.camera.calibration))
+    log = FlightLog(config.log.flight_log, clock)
+    maps = MapStore(config.map.directory)
+    group = Group(config.swarm, config.system_id)
+    camera = open_camera(config.camera, sensor, clock)
+    autopilot = AutopilotLink(config.autopilot, config.system_id, clock)
+    health = Health(autopilot, log)
+    # Frames never wait for a map that is being built: one thread for each.
+    vision = ThreadPoolExecutor(1, "vision")
+    mapping = ThreadPoolExecutor(1, "mapping")
+    exchange = Exchange(
+        config.system_id,
+        group,
+        Transfers(config.transfer, np.random.default_rng()),
+        maps,
+        autopilot,
+        sensor,
+        clock,
+        log,
+        mapping,
+        lambda: companion.is_localized,
+        ExchangeOptions(config.swarm, config.map, config.features, config.localization.detector),
+    )
+    companion = Companion(
+        camera,
+        sensor,
+        clock,
+        autopilot,
+        maps,
+        exchange.on_frame,
+        health,
+        log,
+        vision,
+        CompanionOptions(config.features, config.localization, config.filter),
+    )
+    peers = PeerLink(
+        config.peers,
+        config.system_id,
+        frozenset(group.members),
+        exchange.on_tunnel,
+        exchange.on_heartbeat,
+    )
+    exchange.attach(peers)
+    began_at_s = time.monotonic()
+    try:
+        await _until_ended(ended, camera, companion, autopilot, peers, exchange, health)
+    finally:
+        notify.stopping()
+        await camera.close()
+        vision.shutdown(wait=False, cancel_futures=True)
+        mapping.shutdown(wait=False, cancel_futures=True)
+        usage = resource.getrusage(resource.RUSAGE_SELF)
+        log.close(
+            cpu_s=usage.ru_utime + usage.ru_stime,
+            wall_s=time.monotonic() - began_at_s,
+            resident_mb=usage.ru_maxrss / 1024,
+            peer_bytes_sent=peers.counters.bytes_out,
+            peer_bytes_received=peers.counters.bytes_in,
+        )
+    return 0
+
+
+async def _until_ended(
+    ended: asyncio.Event,
+    camera: CameraSource,
+    companion: Companion,
+    autopilot: AutopilotLink,
+    peers: PeerLink,
+    exchange: Exchange,
+    health: Health,
+) -> None:
+    """Run every part until the end is asked for; the first that fails ends all."""
+    tasks = [
+        asyncio.ensure_future(part)
+        for part in (
+            autopilot.run(),
+            peers.run(),
+            exchange.run(),
+            companion.run(),
+            health.run(),
+        )
+    ]
+    reading = asyncio.ensure_future(companion.read_camera())
+    stop = asyncio.ensure_future(ended.wait())
+    notify.ready()
+    try:
+        done, _ = await asyncio.wait({*tasks, reading, stop}, return_when=asyncio.FIRST_COMPLETED)
+        if reading in done and reading.exception() is None and stop not in done:
+            _log.info("the camera's stream is over")
+            await companion.idle()
+    finally:
+        for task in (*tasks, reading, stop):
+            task.cancel()
+        results = await asyncio.gather(*tasks, reading, return_exceptions=True)
+    for result in results:
+        if isinstance(result, BaseException) and not isinstance(result, asyncio.CancelledError):
+            raise _first_cause(result)
+
+
+def _first_cause(error: BaseException) -> BaseException:
+    """Unwrap a task group's failure, so that an expected one stays one line."""
+    while isinstance(error, BaseExceptionGroup):
+        expected = error.subgroup(VclError)
+        error = (expected or error).exceptions[0]
+    return error

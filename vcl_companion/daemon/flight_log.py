@@ -1,0 +1,98 @@
+"""What happened to every frame, as JSON lines: for the report and for the day after."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections import Counter
+from pathlib import Path
+from typing import IO
+
+from vcl_companion.cameras.source import Outcome
+from vcl_companion.clock import Clock
+from vcl_companion.errors import ConfigError
+
+_log = logging.getLogger(__name__)
+
+
+class FlightLog:
+    """Writes one line per frame, event and map; counts frames even when no file is kept.
+
+    Args:
+        path: the file, replaced when it exists; empty for none.
+        clock: stamps events.
+
+    Raises:
+        ConfigError: the file cannot be written.
+    """
+
+    def __init__(self, path: str, clock: Clock) -> None:
+        self._clock = clock
+        self._file: IO[str] | None = None
+        self.frames: Counter[str] = Counter({"localized": 0, "refused": 0, "dropped": 0})
+        self.refusals: Counter[str] = Counter()
+        if path:
+            try:
+                Path(path).parent.mkdir(parents=True, exist_ok=True)
+                self._file = open(path, "w", encoding="utf-8", buffering=1)  # noqa: SIM115 kept open
+            except OSError as error:
+                raise ConfigError(f"[log] flight_log {path}: {error.strerror}") from error
+
+    def frame(
+        self,
+        sequence: int,
+        captured_at_ns: int,
+        outcome: Outcome,
+        *,
+        reason: str = "",
+        latency_ms: float | None = None,
+        matched: int = 0,
+        inliers: int = 0,
+    ) -> None:
+        """Write what became of a frame."""
+        self.frames[outcome] += 1
+        if outcome == "refused":
+            self.refusals[reason] += 1
+        self._write(
+            kind="frame",
+            sequence=sequence,
+            captured_at_ns=captured_at_ns,
+            outcome=outcome,
+            reason=reason or None,
+            latency_ms=latency_ms,
+            matched=matched,
+            inliers=inliers,
+        )
+
+    def event(self, event: str, reason: str) -> None:
+        """Write something that changed."""
+        self._write(kind="event", at_ns=self._clock.now_ns(), event=event, reason=reason)
+
+    def map(self, revision: bytes, n_landmarks: int, n_bytes: int, n_keyframes: int) -> None:
+        """Write that another map is flown on."""
+        self._write(
+            kind="map",
+            at_ns=self._clock.now_ns(),
+            revision=revision.hex(),
+            landmarks=n_landmarks,
+            bytes=n_bytes,
+            keyframes=n_keyframes,
+        )
+
+    def close(self, **summary: float) -> None:
+        """Write the totals and let go of the file."""
+        self._write(
+            kind="summary", frames=dict(self.frames), refusals=dict(self.refusals), **summary
+        )
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _write(self, **record: object) -> None:
+        if self._file is None:
+            return
+        try:
+            self._file.write(json.dumps(record) + "\n")
+        except OSError as error:  # a full disk must not end the flight
+            _log.error("the flight log ends here: %s", error.strerror)
+            self._file = None

@@ -1,0 +1,87 @@
+"""How the service is: told to the autopilot, to systemd and to the log, when it changes."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+
+from vcl_companion.daemon import notify
+from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.links.autopilot import AutopilotLink, ServiceState, Severity
+
+_log = logging.getLogger(__name__)
+
+_NUMBER = re.compile(r"\d+")
+
+_CHECK_S = 0.5
+# No frame answered for this long: the path from frame to pose is stalled.
+_STALLED_S = 5.0
+# Refused frames for this long are a state, not a hiccup.
+_LOST_S = 1.0
+# The same state for another reason is said again, but not more often than this.
+_SAY_AGAIN_S = 5.0
+
+
+class Health:
+    """Follows the frames' outcomes; everything happens in the event loop's thread."""
+
+    def __init__(self, autopilot: AutopilotLink, log: FlightLog) -> None:
+        self._autopilot = autopilot
+        self._log = log
+        self._state = ServiceState.STARTING
+        self._said = ""
+        self._said_at_s = float("-inf")
+        self._last_answer_s: float | None = None
+        self._last_fix_s: float | None = None
+
+    def localized(self) -> None:
+        """Note that a frame gave a pose which was sent."""
+        now_s = asyncio.get_running_loop().time()
+        self._last_answer_s = self._last_fix_s = now_s
+        self._tell(ServiceState.ACTIVE, Severity.INFO, "localized", "found")
+
+    def refused(self, reason: str) -> None:
+        """Note that a frame gave no pose, and why: nothing was sent."""
+        now_s = asyncio.get_running_loop().time()
+        self._last_answer_s = now_s
+        if self._last_fix_s is None:
+            self._tell(ServiceState.STANDBY, Severity.NOTICE, f"waiting: {reason}", "waiting")
+        elif now_s - self._last_fix_s >= _LOST_S or self._state is ServiceState.CRITICAL:
+            self._tell(ServiceState.CRITICAL, Severity.WARNING, f"lost: {reason}", "lost")
+
+    def waiting_for_map(self) -> None:
+        """Note that a frame waits for the first map: alive, though nothing is answered."""
+        self._last_answer_s = asyncio.get_running_loop().time()
+        if self._state is ServiceState.STARTING:
+            self._tell(ServiceState.STANDBY, Severity.INFO, "waiting for a map", "waiting")
+
+    async def run(self) -> None:
+        """Feed systemd's watchdog while frames are answered; fall silent when they are not."""
+        while True:
+            await asyncio.sleep(_CHECK_S)
+            if self._last_answer_s is None:
+                notify.watchdog()  # no frame yet: the camera's own errors end the service
+                continue
+            idle_s = asyncio.get_running_loop().time() - self._last_answer_s
+            if idle_s < _STALLED_S:
+                notify.watchdog()
+            elif self._state is not ServiceState.STALLED:
+                text = f"no frame was answered for {idle_s:.0f} s"
+                self._tell(ServiceState.STALLED, Severity.ERROR, text, "stalled")
+
+    def _tell(self, state: ServiceState, severity: Severity, text: str, event: str) -> None:
+        """Say a new state at once, a new reason for the same one now and then."""
+        now_s = asyncio.get_running_loop().time()
+        gist = _NUMBER.sub("#", text)  # "4 landmarks agree", "5 landmarks agree": one reason
+        if state is self._state:
+            if gist == self._said or now_s - self._said_at_s < _SAY_AGAIN_S:
+                return
+        else:
+            self._state = state
+            self._autopilot.set_state(state)
+        self._said, self._said_at_s = gist, now_s
+        self._autopilot.say(severity, f"VCL {text}")
+        self._log.event(event, text)
+        notify.status(text)
+        _log.log(logging.INFO if severity > Severity.WARNING else logging.WARNING, text)

@@ -1,0 +1,88 @@
+"""The map a drone flies on: one revision at a time, replaced by one assignment."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+from vcl_companion.errors import ConfigError
+from vcl_companion.localization.map_index import MapIndex
+from vcl_companion.wire.map_codec import revision_of
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredMap:
+    """A revision in use.
+
+    Attributes:
+        revision: its content hash.
+        data: its encoded form, as handed on to peers.
+        index: ready for localization.
+    """
+
+    revision: bytes
+    data: bytes
+    index: MapIndex
+
+    @property
+    def n_landmarks(self) -> int:
+        """Number of landmarks."""
+        return len(self.index.landmark_map.points_world)
+
+
+class MapStore:
+    """Holds the current revision, and tells those who wait for one.
+
+    Args:
+        directory: where every revision is kept as ``<revision>.vclmap``; empty for nowhere.
+
+    Raises:
+        ConfigError: the directory cannot be made.
+    """
+
+    def __init__(self, directory: str) -> None:
+        self.current: StoredMap | None = None
+        self.refusal = ""
+        self._directory = Path(directory) if directory else None
+        self._decided = asyncio.Event()
+        if self._directory is not None:
+            try:
+                self._directory.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise ConfigError(f"[map] directory {directory}: {error.strerror}") from error
+
+    def replace(self, data: bytes, index: MapIndex) -> StoredMap:
+        """Fly on this map from the next frame on."""
+        stored = StoredMap(revision_of(data), data, index)
+        self.current = stored
+        self.refusal = ""
+        self._decided.set()
+        if self._directory is not None:
+            self._save(self._directory / f"{stored.revision.hex()}.vclmap", data)
+        return stored
+
+    def refuse(self, reason: str) -> None:
+        """Let those who wait for a first map know that there is none this time, and why."""
+        if self.current is None:
+            self.refusal = reason
+            self._decided.set()
+
+    async def decided(self) -> StoredMap | None:
+        """Wait until there is a map, or until the next attempt at a first one has failed."""
+        if self.current is None:
+            self._decided.clear()
+            await self._decided.wait()
+        return self.current
+
+    def _save(self, path: Path, data: bytes) -> None:
+        """Write beside and rename, so that a power cut leaves no half map."""
+        partial = path.with_suffix(".partial")
+        try:
+            partial.write_bytes(data)
+            partial.replace(path)
+        except OSError as error:
+            _log.error("the map %s cannot be kept: %s", path, error.strerror)
