@@ -1,0 +1,1 @@
+"""The swarm in software: rendered or recorded flights, real daemons, stand-in autopilots."""

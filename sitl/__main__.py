@@ -1,0 +1,179 @@
+"""The command ``python -m sitl``: render scenes, import recordings, fly them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import click
+
+from vcl_companion.errors import VclError
+
+_DEMO = Path(__file__).parent / "recordings" / "demo"
+_FOLDER = click.Path(path_type=Path)
+
+
+def _speed(_: click.Context, param: click.Parameter, value: str) -> float:
+    """Return ``max`` as infinity, else a positive number."""
+    try:
+        speed = math.inf if value == "max" else float(value)
+    except ValueError:
+        speed = math.nan
+    if not speed > 0.0:
+        raise click.BadParameter(f"{value!r} is neither a positive number nor max", param=param)
+    return speed
+
+
+class _Commands(click.Group):
+    """A group whose failures are one line: 2 for bad input, 1 for a flight that broke off."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        from sitl.processes import FlightError
+
+        try:
+            return super().invoke(ctx)
+        except VclError as error:
+            click.echo(f"sitl: {' '.join(str(error).split())}", err=True)
+            ctx.exit(1 if isinstance(error, FlightError) else 2)
+        except KeyboardInterrupt:
+            click.echo("sitl: interrupted", err=True)
+            ctx.exit(130)
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+def main() -> None:
+    """Fly a swarm in software: real daemons, stand-in autopilots, recorded or rendered images."""
+
+
+@main.command()
+@click.argument("recording", metavar="[RECORDING]", default="demo", type=_FOLDER)
+@click.option("--out", required=True, metavar="DIR", type=_FOLDER, help="Results; made if absent.")
+@click.option(
+    "--speed",
+    default="1",
+    show_default=True,
+    metavar="X|max",
+    callback=_speed,
+    help="Seconds of the recording per second, or max: as fast as all daemons keep up.",
+)
+@click.option(
+    "--drones", default="", metavar="mav0,mav1", help="Only these fly; otherwise all of them."
+)
+@click.option(
+    "--known-distance",
+    "distances",
+    multiple=True,
+    metavar="mav0:mav1=1.63",
+    help="Metres between two drones at the start (repeatable), instead of the recording's.",
+)
+@click.option(
+    "--attitude",
+    metavar="DIR",
+    type=_FOLDER,
+    help="Send the attitude streams of an earlier flight again: its --out.",
+)
+@click.option(
+    "--seed", default=0, show_default=True, help="Of the noise of the attitude made from the truth."
+)
+@click.option(
+    "--start-timeout",
+    default=30.0,
+    show_default=True,
+    metavar="S",
+    help="How long the daemons have to come up, and again to make the first map.",
+)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="SECTION.KEY=VALUE",
+    help="More of the daemons' configuration, the value in TOML's notation (repeatable).",
+)
+def fly(
+    recording: Path,
+    out: Path,
+    speed: float,
+    drones: str,
+    distances: tuple[str, ...],
+    attitude: Path | None,
+    seed: int,
+    start_timeout: float,
+    settings: tuple[str, ...],
+) -> None:
+    """Fly RECORDING (a folder; the embedded demo by default) and report how it went.
+
+    One real daemon and one stand-in autopilot per drone, over real sockets.
+    Leaves estimates, truth, report.json and report.html in the output folder.
+    Exit status: 0, 2 for input that cannot be used, 1 when a process ended.
+    """
+    from rich.console import Console
+
+    from sitl.fly import fly as fly_recording
+    from sitl.plan import FlyOptions, parse_known_distance, parse_setting
+    from sitl.terminal import progress_shown, show_report
+
+    options = FlyOptions(
+        speed=speed,
+        attitude=attitude,
+        known_distances=tuple(map(parse_known_distance, distances)),
+        drones=tuple(name.strip() for name in drones.split(",") if name.strip()),
+        start_timeout_s=start_timeout,
+        settings=tuple(map(parse_setting, settings)),
+        seed=seed,
+    )
+    embedded = str(recording) == "demo" and not recording.exists()
+    console = Console()
+    with progress_shown(console) as progress:
+        report = fly_recording(_DEMO if embedded else recording, out, options, progress)
+    show_report(console, report, out)
+
+
+@main.command()
+@click.argument("scenario")
+@click.option("--out", required=True, metavar="DIR", type=_FOLDER, help="A new or empty folder.")
+def render(scenario: str, out: Path) -> None:
+    """Render SCENARIO (a TOML file, or the name of an embedded one) into a recording."""
+    from rich.console import Console
+
+    from sitl.render import render_scenario
+    from sitl.scenario import load_scenario
+    from sitl.terminal import progress_shown
+
+    with progress_shown(Console()) as progress:
+        render_scenario(
+            load_scenario(scenario), out, lambda done, total: progress("rendering", done, total)
+        )
+    click.echo(f"recording: {out}")
+
+
+@main.group(name="import")
+def import_() -> None:
+    """Turn recordings of other makers into ours."""
+
+
+@import_.command()
+@click.argument("source", type=_FOLDER)
+@click.option("--out", required=True, metavar="DIR", type=_FOLDER, help="A new or empty folder.")
+def airsim(source: Path, out: Path) -> None:
+    """Import SOURCE, an AirSim folder with airsim_rec.txt; settings.json lies there or above."""
+    from vcl_companion.recording.airsim import import_airsim
+
+    import_airsim(source, out)
+    click.echo(f"recording: {out}")
+
+
+@import_.command()
+@click.argument("sequence", type=_FOLDER)
+@click.option("--poses", metavar="FILE", type=_FOLDER, help="The sequence's true poses, NN.txt.")
+@click.option("--out", required=True, metavar="DIR", type=_FOLDER, help="A new or empty folder.")
+def kitti(sequence: Path, poses: Path | None, out: Path) -> None:
+    """Import SEQUENCE, a KITTI odometry folder (sequences/NN), as a recording of one drone."""
+    from vcl_companion.recording.kitti import import_kitti
+
+    import_kitti(sequence, poses, out)
+    click.echo(f"recording: {out}")
+
+
+if __name__ == "__main__":
+    main(prog_name="python -m sitl")

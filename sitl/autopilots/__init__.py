@@ -1,0 +1,1 @@
+"""Autopilots for flights in software, each a process of its own."""

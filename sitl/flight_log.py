@@ -1,0 +1,175 @@
+"""What a flight left on disk: the daemons' logs, and what the autopilots heard."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import msgspec
+import numpy as np
+
+from sitl.evaluation import Estimates, covariance_from_upper
+from sitl.processes import FlightError
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import matrix_from_euler
+
+COMPANION_COMPONENT = 197
+_Row = TypeVar("_Row", bound=msgspec.Struct)
+
+
+class FrameRow(msgspec.Struct, frozen=True):
+    """What became of one frame, and how long it took from its arrival to that.
+
+    ``latency_ms`` is None for a frame that was never looked at.
+    """
+
+    sequence: int
+    captured_at_ns: int
+    outcome: Literal["localized", "refused", "dropped"]
+    reason: str | None = None
+    latency_ms: float | None = None
+    matched: int = 0
+    inliers: int = 0
+
+
+class EventRow(msgspec.Struct, frozen=True):
+    """Something that happened aboard."""
+
+    at_ns: int
+    event: str
+    reason: str | None = None
+
+
+class MapRow(msgspec.Struct, frozen=True):
+    """A revision of the shared map that came into use."""
+
+    at_ns: int
+    revision: str
+    landmarks: int
+    bytes: int
+    keyframes: int
+
+
+class SummaryRow(msgspec.Struct, frozen=True):
+    """What a daemon says of itself at its end; ``resident_mb`` is its peak."""
+
+    frames: dict[str, int]
+    refusals: dict[str, int]
+    cpu_s: float
+    wall_s: float
+    resident_mb: float
+    peer_bytes_sent: int
+    peer_bytes_received: int
+
+
+@dataclass(frozen=True)
+class FlightLog:
+    """One daemon's ``flight.jsonl``; ``summary`` is None when it did not end cleanly."""
+
+    frames: tuple[FrameRow, ...]
+    events: tuple[EventRow, ...]
+    maps: tuple[MapRow, ...]
+    summary: SummaryRow | None
+
+    def count(self, outcome: str) -> int:
+        """Return how many frames had an outcome."""
+        return sum(frame.outcome == outcome for frame in self.frames)
+
+    def refusals(self) -> dict[str, int]:
+        """Return how often each reason was given for a refused frame, the commonest first."""
+        reasons = (f.reason or "no reason given" for f in self.frames if f.outcome == "refused")
+        return dict(Counter(reasons).most_common())
+
+
+def read_flight_log(path: Path) -> FlightLog:
+    """Read a daemon's log; kinds of lines not known here are passed over.
+
+    Raises:
+        FlightError: a line is not what it should be; names file and row.
+    """
+    frames: list[FrameRow] = []
+    events: list[EventRow] = []
+    maps: list[MapRow] = []
+    summary: SummaryRow | None = None
+    for row, line in _json_lines(path):
+        match line.get("kind"):
+            case "frame":
+                frames.append(_converted(line, FrameRow, path, row))
+            case "event":
+                events.append(_converted(line, EventRow, path, row))
+            case "map":
+                maps.append(_converted(line, MapRow, path, row))
+            case "summary":
+                summary = _converted(line, SummaryRow, path, row)
+    return FlightLog(tuple(frames), tuple(events), tuple(maps), summary)
+
+
+class _VisionPosition(msgspec.Struct, frozen=True):
+    usec: int
+    x: float
+    y: float
+    z: float
+    roll: float
+    pitch: float
+    yaw: float
+    covariance: list[float]
+    reset_counter: int = 0
+
+
+def read_received(path: Path, system_id: int) -> Estimates:
+    """Read the poses that an autopilot heard from its companion, in order of arrival.
+
+    ``at_ns`` is what the message says, to its microsecond.
+
+    Raises:
+        FlightError: a line is not what it should be; names file and row.
+    """
+    at_ns, poses, covariances = [], [], []
+    for row, line in _json_lines(path):
+        if (
+            line.get("type") != "VISION_POSITION_ESTIMATE"
+            or line.get("system") != system_id
+            or line.get("component") != COMPANION_COMPONENT
+        ):
+            continue
+        said = _converted(line.get("fields"), _VisionPosition, path, row)
+        try:
+            rotation = matrix_from_euler(said.roll, said.pitch, said.yaw)
+            poses.append(Pose(rotation, np.array([said.x, said.y, said.z])))
+            covariances.append(covariance_from_upper(np.array(said.covariance, dtype=float)))
+        except ValueError as error:
+            raise FlightError(f"{path}, row {row}: {error}") from error
+        at_ns.append(said.usec * 1000)
+    return Estimates(
+        np.array(at_ns, dtype=np.int64), tuple(poses), np.array(covariances).reshape(-1, 6, 6)
+    )
+
+
+def _json_lines(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield (row, object) of a file of JSON lines; rows count from 1."""
+    try:
+        lines = path.read_text(encoding="utf-8").split("\n")
+    except OSError as error:
+        raise FlightError(f"{path}: {error.strerror}") from error
+    for row, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        try:
+            # Not msgspec: an autopilot may hear NaN, which strict JSON cannot say.
+            value = json.loads(line)
+        except ValueError as error:
+            raise FlightError(f"{path}, row {row}: not JSON ({error})") from error
+        if not isinstance(value, dict):
+            raise FlightError(f"{path}, row {row}: not a JSON object")
+        yield row, value
+
+
+def _converted(value: object, kind: type[_Row], path: Path, row: int) -> _Row:
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        raise FlightError(f"{path}, row {row}: {error}") from error

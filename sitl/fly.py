@@ -1,0 +1,185 @@
+"""One flight from a recording to its report: real processes, real sockets, the recording's time."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sitl.out_folder import prepare_folder
+from sitl.pacing import Instant, Pace, gate, instants
+from sitl.plan import FlightPlan, FlyOptions, plan_flight
+from sitl.processes import FlightError, unless_one_ends
+from sitl.report import write_report
+from sitl.result import Event, gather
+from sitl.swarm import Swarm
+from sitl.trajectory_files import write_trajectories
+from vcl_companion.recording import read_recording
+
+_ANSWER_TIMEOUT_S = 60.0
+
+Progress = Callable[[str, int, int], None]
+"""Is told what is being done, how many frames are through, and of how many."""
+
+
+@dataclass
+class Conduct:
+    """How the harness itself did.
+
+    Attributes:
+        start_s: wall time from the first frame to the first map.
+        flight_s: wall time of everything after.
+        late_ms: by how much each frame was handed out later than it was due.
+        events: what should be known.
+    """
+
+    start_s: float = 0.0
+    flight_s: float = 0.0
+    late_ms: list[float] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+
+
+def fly(recording_path: Path, out: Path, options: FlyOptions, progress: Progress) -> dict[str, Any]:
+    """Fly a recording, leave everything about it in ``out``, and return what report.json says.
+
+    Raises:
+        VclError: the recording or an option cannot be used.
+        FlightError: a process ended or hung; all others have been ended too.
+        KeyboardInterrupt: likewise, on Ctrl-C.
+    """
+    progress("reading the recording", 0, 0)
+    plan = plan_flight(read_recording(recording_path), options)
+    prepare_folder(out, plan)
+    conduct = asyncio.run(_flown(plan, out, progress))
+    progress("writing the report", 0, 0)
+    result = gather(plan, out, conduct.events)
+    write_trajectories(result, out)
+    return write_report(
+        result,
+        out,
+        start_s=conduct.start_s,
+        flight_s=conduct.flight_s,
+        late_ms=float(np.percentile(conduct.late_ms, 99.0)) if conduct.late_ms else None,
+    )
+
+
+async def _flown(plan: FlightPlan, out: Path, progress: Progress) -> Conduct:
+    swarm = Swarm(plan, out)
+    conduct = Conduct()
+    with _ended_by_sigterm():
+        try:
+            progress("starting the daemons", 0, 0)
+            await swarm.start()
+            await unless_one_ends(swarm.children, _play(plan, swarm, conduct, progress))
+            progress("ending the daemons", 0, 0)
+            for drone in swarm.drones:
+                drone.camera.say_end(plan.ends_at_ns)
+            await swarm.finish()
+        finally:
+            await swarm.end()
+    return conduct
+
+
+@contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM end the flight as Ctrl-C does: through every ``finally``."""
+    loop = asyncio.get_running_loop()
+    task = asyncio.current_task()
+    asked = False
+
+    def end() -> None:
+        nonlocal asked
+        asked = True
+        if task is not None:
+            task.cancel()
+
+    loop.add_signal_handler(signal.SIGTERM, end)
+    try:
+        yield
+    except asyncio.CancelledError:
+        if asked:
+            raise SystemExit(128 + signal.SIGTERM) from None
+        raise
+    finally:
+        loop.remove_signal_handler(signal.SIGTERM)
+
+
+async def _play(plan: FlightPlan, swarm: Swarm, conduct: Conduct, progress: Progress) -> None:
+    """Hand out every frame at its time, after the attitude of that instant."""
+    speed = plan.options.speed
+    flat_out = math.isinf(speed)
+    frames_at_ns = [drone.frames_at_ns for drone in plan.drones]
+    moments = instants(frames_at_ns, flat_out)
+    holds_after = gate(moments, len(plan.drones))
+    n_frames = sum(map(len, frames_at_ns))
+    n_given = 0
+    begun_s = time.monotonic()
+    pace = Pace(speed, moments[0].at_ns, begun_s)
+    for k, moment in enumerate(moments):
+        if flat_out and moment.frames and k > holds_after:
+            await _all_answered(swarm)
+        await asyncio.sleep(max(0.0, pace.wait_s(moment.at_ns, time.monotonic())))
+        await _hand_out(moment, swarm)
+        n_given += len(moment.frames)
+        if not flat_out and k > holds_after:
+            late_s = -pace.wait_s(moment.at_ns, time.monotonic())
+            conduct.late_ms += [late_s * 1e3] * len(moment.frames)
+        if k == holds_after:
+            progress("making the first map", n_given, n_frames)
+            await _first_map(plan, swarm, conduct)
+            conduct.start_s = time.monotonic() - begun_s
+            pace = Pace(speed, moment.at_ns, time.monotonic())
+        elif moment.frames and k > holds_after:
+            progress("flying", n_given, n_frames)
+    await _all_answered(swarm)
+    conduct.flight_s = time.monotonic() - begun_s - conduct.start_s
+
+
+async def _hand_out(moment: Instant, swarm: Swarm) -> None:
+    await swarm.advance_to(moment.at_ns)
+    given = {due.drone: due for due in moment.frames}
+    for n, drone in enumerate(swarm.drones):
+        if n in given:
+            frame = drone.planned.drone.frames[given[n].sequence]
+            drone.camera.give(given[n].sequence, moment.at_ns, frame.path.read_bytes())
+        else:
+            drone.camera.tell_time(moment.at_ns)
+
+
+async def _first_map(plan: FlightPlan, swarm: Swarm, conduct: Conduct) -> None:
+    """Hold the recording until every drone's first frame is answered, or the time is up.
+
+    A swarm without a map is still flown: what it says about it is the result.
+    """
+    timeout_s = plan.options.start_timeout_s
+    try:
+        async with asyncio.timeout(timeout_s):
+            for drone in swarm.drones:
+                await drone.camera.answered()
+    except TimeoutError:
+        for drone in swarm.drones:
+            if drone.camera.unanswered():
+                why = f"first frame not answered within {timeout_s:.0f} s; flown on without"
+                conduct.events.append(Event(0.0, drone.planned.name, "harness", why))
+
+
+async def _all_answered(swarm: Swarm) -> None:
+    try:
+        async with asyncio.timeout(_ANSWER_TIMEOUT_S):
+            for drone in swarm.drones:
+                await drone.camera.answered()
+    except TimeoutError:
+        late = next(drone for drone in swarm.drones if drone.camera.unanswered())
+        frame = late.camera.unanswered()[0]
+        raise FlightError(
+            f"daemon of {late.planned.name} has not answered frame {frame} "
+            f"within {_ANSWER_TIMEOUT_S:.0f} s"
+        ) from None

@@ -1,0 +1,133 @@
+"""One drone's camera, seen from the simulator: serves frames, collects the answers.
+
+The protocol is ``vcl_companion.cameras.stream``'s; this is its other end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+
+from sitl.processes import FlightError
+from vcl_companion.cameras.source import Outcome
+from vcl_companion.cameras.stream import (
+    Record,
+    StreamEnd,
+    StreamFrame,
+    StreamTime,
+    encode_record,
+    read_answer,
+)
+from vcl_companion.errors import WireError
+
+# A daemon reads its camera without pause; this much unread means that it does not.
+_MAX_UNREAD_BYTES = 32 * 1024 * 1024
+
+
+class FrameServer:
+    """Serves one connection on 127.0.0.1; the daemon is the client.
+
+    Attributes:
+        drone: whose camera this is.
+        outcomes: sequence to what the daemon said became of that frame.
+        n_given: frames handed out so far.
+    """
+
+    def __init__(self, drone: str) -> None:
+        self.drone = drone
+        self.outcomes: dict[int, Outcome] = {}
+        self.n_given = 0
+        self._server: asyncio.Server | None = None
+        self._writer: asyncio.StreamWriter | None = None
+        self._changed = asyncio.Condition()
+        self._failure: str | None = None
+
+    async def start(self) -> int:
+        """Listen and return the port."""
+        self._server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
+        port: int = self._server.sockets[0].getsockname()[1]
+        return port
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether a daemon has ever connected."""
+        return self._writer is not None
+
+    async def connected(self) -> None:
+        """Wait until the daemon has connected."""
+        async with self._changed:
+            await self._changed.wait_for(lambda: self.is_connected)
+
+    def give(self, sequence: int, at_ns: int, image_bytes: bytes) -> None:
+        """Hand out one frame: an encoded image, byte for byte.
+
+        Raises:
+            FlightError: the daemon hung up, or does not read what it is given.
+        """
+        self._send(StreamFrame(sequence, at_ns, image_bytes))
+        self.n_given += 1
+
+    def tell_time(self, at_ns: int) -> None:
+        """Move the daemon's clock on."""
+        self._send(StreamTime(at_ns))
+
+    def say_end(self, at_ns: int) -> None:
+        """Say that no frame follows."""
+        self._send(StreamEnd(at_ns))
+
+    async def answered(self) -> None:
+        """Wait until every frame handed out so far has been answered.
+
+        Raises:
+            FlightError: the daemon hung up or broke the protocol before.
+        """
+        async with self._changed:
+            await self._changed.wait_for(
+                lambda: self._failure is not None or len(self.outcomes) >= self.n_given
+            )
+        if len(self.outcomes) < self.n_given:
+            raise FlightError(self._failure or "")
+
+    def unanswered(self) -> list[int]:
+        """Return the frames handed out that no answer has come for."""
+        return [n for n in range(self.n_given) if n not in self.outcomes]
+
+    async def close(self) -> None:
+        """Hang up and stop listening."""
+        if self._server is not None:
+            self._server.close()
+        if self._writer is not None:
+            self._writer.transport.abort()
+
+    def _send(self, record: Record) -> None:
+        if self._writer is None or self._failure is not None:
+            raise FlightError(self._failure or f"daemon of {self.drone} is not connected")
+        if self._writer.transport.get_write_buffer_size() > _MAX_UNREAD_BYTES:
+            raise FlightError(f"daemon of {self.drone} does not read its camera stream")
+        self._writer.write(encode_record(record))
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if self._writer is not None:
+            # A camera has one owner; a second connection is a bug worth seeing in its log.
+            writer.transport.abort()
+            return
+        async with self._changed:
+            self._writer = writer
+            self._changed.notify_all()
+        failure = f"daemon of {self.drone} closed its camera stream"
+        try:
+            while (answer := await read_answer(reader)) is not None:
+                await self._take(answer.sequence, answer.outcome)
+        except (WireError, OSError) as error:
+            failure = f"daemon of {self.drone}, camera stream: {error}"
+        finally:
+            async with self._changed:
+                self._failure = failure
+                self._changed.notify_all()
+            writer.transport.abort()
+
+    async def _take(self, sequence: int, outcome: Outcome) -> None:
+        if sequence >= self.n_given or sequence in self.outcomes:
+            raise WireError(f"answers frame {sequence}, which is not waiting for one")
+        async with self._changed:
+            self.outcomes[sequence] = outcome
+            self._changed.notify_all()

@@ -1,0 +1,51 @@
+"""A flight's output folder: made, and on the next flight cleared of what flights write."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+from sitl.plan import FlightPlan
+from vcl_companion.errors import ConfigError
+
+_MARK = Path("run") / "flight.json"
+_OWN_FILES = ("estimate.tum", "covariance.csv", "truth.tum", "received.jsonl", "attitude.csv")
+_OWN_REPORTS = ("report.json", "report.html")
+
+
+def prepare_folder(out: Path, plan: FlightPlan) -> None:
+    """Make the output folder, without what an earlier flight left in it.
+
+    Raises:
+        ConfigError: it holds something else, or cannot be written.
+    """
+    earlier = plan.options.attitude
+    try:
+        if earlier is not None and out.resolve() == earlier.resolve():
+            raise ConfigError(f"--out and --attitude are the same folder, {out}")
+        if out.exists() and not out.is_dir():
+            raise ConfigError(f"{out}: is a file; give a folder")
+        if out.is_dir() and any(out.iterdir()) and not (out / _MARK).is_file():
+            raise ConfigError(f"{out}: holds something other than a flight; give another folder")
+        _remove_earlier(out)
+        for drone in plan.drones:
+            (out / drone.name).mkdir(parents=True, exist_ok=True)
+            (out / "run" / drone.name / "maps").mkdir(parents=True)
+        marks = {"recording": str(plan.recording.path.resolve())}
+        (out / _MARK).write_text(json.dumps(marks) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be written ({error.strerror})") from error
+
+
+def _remove_earlier(out: Path) -> None:
+    """Remove what flights write, by name; never a file that is not theirs."""
+    for folder in out.glob("mav*"):
+        for name in _OWN_FILES:
+            (folder / name).unlink(missing_ok=True)
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+    for name in _OWN_REPORTS:
+        (out / name).unlink(missing_ok=True)
+    if (out / "run").is_dir():
+        shutil.rmtree(out / "run")

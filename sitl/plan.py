@@ -1,0 +1,238 @@
+"""What a flight will be: who flies, who leads, which distances are known, who says the attitude."""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vcl_companion.errors import ConfigError
+from vcl_companion.recording import Drone, KnownPair, Recording
+
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One key of the daemon's configuration, given by hand.
+
+    Attributes:
+        path: sections and key.
+        value: what TOML made of the text.
+    """
+
+    path: tuple[str, ...]
+    value: object
+
+
+@dataclass(frozen=True)
+class FlyOptions:
+    """How a recording is flown.
+
+    Attributes:
+        speed: recording seconds per wall second; infinite: as fast as all daemons keep up.
+        attitude: output folder of an earlier flight whose attitude streams are sent again.
+        known_distances: instead of the recording's; a pair without metres is taken
+            from the truth at the start.
+        drones: names of those that fly; empty: all.
+        start_timeout_s: how long the daemons have to come up, and again to make the first map.
+        settings: more of the daemons' configuration.
+        seed: of the noise of the attitude.
+    """
+
+    speed: float = 1.0
+    attitude: Path | None = None
+    known_distances: tuple[KnownPair, ...] = ()
+    drones: tuple[str, ...] = ()
+    start_timeout_s: float = 30.0
+    settings: tuple[Setting, ...] = ()
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.speed > 0.0:
+            raise ConfigError(f"--speed must be positive or max, got {self.speed}")
+        if not 0.0 < self.start_timeout_s < math.inf:
+            raise ConfigError(f"--start-timeout must be positive, got {self.start_timeout_s}")
+        if self.seed < 0:
+            raise ConfigError(f"--seed must not be negative, got {self.seed}")
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedDrone:
+    """One drone of a flight.
+
+    Attributes:
+        drone: what it recorded.
+        system_id: its MAVLink system id.
+        attitude_path: attitude stream that is sent again; None: made from the truth.
+    """
+
+    drone: Drone
+    system_id: int
+    attitude_path: Path | None
+
+    @property
+    def name(self) -> str:
+        """``mavN``."""
+        return self.drone.name
+
+    @property
+    def frames_at_ns(self) -> NDArray[np.int64]:
+        """(F,) instants of its frames."""
+        return np.array([frame.at_ns for frame in self.drone.frames], dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class FlightPlan:
+    """A flight, ready to start.
+
+    Attributes:
+        recording: where the images come from.
+        drones: those that fly, in the recording's order.
+        leader: name of the one whose start is the origin.
+        known_distances: (system id, system id, m).
+        options: how it is flown.
+    """
+
+    recording: Recording
+    drones: tuple[PlannedDrone, ...]
+    leader: str
+    known_distances: tuple[tuple[int, int, float], ...]
+    options: FlyOptions
+
+    @property
+    def starts_at_ns(self) -> int:
+        """The first frame's instant; times in a report count from it."""
+        return min(int(drone.frames_at_ns[0]) for drone in self.drones)
+
+    @property
+    def ends_at_ns(self) -> int:
+        """The last frame's instant."""
+        return max(int(drone.frames_at_ns[-1]) for drone in self.drones)
+
+    def system_id(self, name: str) -> int:
+        """Return a drone's MAVLink system id."""
+        return next(drone.system_id for drone in self.drones if drone.name == name)
+
+
+def parse_known_distance(text: str) -> KnownPair:
+    """Return what ``mav0:mav1=1.63`` or ``mav0:mav1`` says.
+
+    Raises:
+        ConfigError: it has another form.
+    """
+    names, equals, metres = text.partition("=")
+    a, colon, b = (part.strip() for part in names.partition(":"))
+    try:
+        if colon and a and b:
+            return KnownPair(a, b, float(metres) if equals else None)
+    except ValueError:
+        pass
+    raise ConfigError(f"--known-distance {text}: expected two drones, like mav0:mav1=1.63 (metres)")
+
+
+def parse_setting(text: str) -> Setting:
+    """Return the setting that ``section.key=value`` says, the value in TOML's notation.
+
+    Raises:
+        ConfigError: it has another form.
+    """
+    name, equals, value = text.partition("=")
+    path = tuple(part.strip() for part in name.split("."))
+    if not equals or not all(_BARE_KEY.fullmatch(part) for part in path):
+        raise ConfigError(f"--set {text}: expected section.key=value")
+    try:
+        table = tomllib.loads(f"value = {value}")
+    except (tomllib.TOMLDecodeError, RecursionError):
+        table = {}
+    if list(table) != ["value"]:
+        raise ConfigError(f"--set {text}: {value!r} is no TOML value (a string needs quotes)")
+    return Setting(path, table["value"])
+
+
+def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:
+    """Decide who flies and with what.
+
+    Raises:
+        ConfigError: an option does not fit the recording; one line, says what would.
+    """
+    names = [drone.name for drone in recording.drones]
+    for name in options.drones:
+        if name not in names:
+            raise ConfigError(f"--drones: {recording.path} has no {name!r} ({', '.join(names)})")
+    flying = [name for name in names if not options.drones or name in options.drones]
+    drones = tuple(
+        PlannedDrone(drone, n + 1, _attitude_path(drone, options.attitude))
+        for n, drone in enumerate(recording.drones)
+        if drone.name in flying
+    )
+    return FlightPlan(
+        recording=recording,
+        drones=drones,
+        leader=recording.leader if recording.leader in flying else flying[0],
+        known_distances=_known_distances(recording, drones, options.known_distances),
+        options=options,
+    )
+
+
+def _attitude_path(drone: Drone, earlier: Path | None) -> Path | None:
+    if earlier is not None:
+        path = earlier / drone.name / "attitude.csv"
+        if not path.is_file():
+            raise ConfigError(f"--attitude {earlier}: no {drone.name}/attitude.csv in it")
+        return path.resolve()
+    if drone.truth is None:
+        raise ConfigError(
+            f"{drone.name} has no ground truth to make the autopilot's attitude of; "
+            "give --attitude DIR, the --out of an earlier flight"
+        )
+    return None
+
+
+def _known_distances(
+    recording: Recording, drones: Sequence[PlannedDrone], given: Sequence[KnownPair]
+) -> tuple[tuple[int, int, float], ...]:
+    by_name = {drone.name: drone for drone in drones}
+    for pair in given:
+        for name in (pair.a, pair.b):
+            if name not in by_name:
+                raise ConfigError(f"--known-distance: {name!r} does not fly ({', '.join(by_name)})")
+    pairs = given or [p for p in recording.known_distances if {p.a, p.b} <= set(by_name)]
+    if not pairs and len(drones) > 1:
+        a, b = drones[0].name, drones[1].name
+        raise ConfigError(
+            f"{recording.path}: no distance is known between two of {', '.join(by_name)}; "
+            f"give --known-distance {a}:{b}=METRES"
+        )
+    out = []
+    for pair in pairs:
+        one, other = by_name[pair.a], by_name[pair.b]
+        distance_m = pair.distance_m
+        if distance_m is None:
+            distance_m = _true_distance_m(one, other)
+        if distance_m is None:
+            raise ConfigError(
+                f"the truth does not say how far {pair.a} is from {pair.b} at the start; "
+                f"give --known-distance {pair.a}:{pair.b}=METRES"
+            )
+        out.append((one.system_id, other.system_id, distance_m))
+    return tuple(out)
+
+
+def _true_distance_m(a: PlannedDrone, b: PlannedDrone) -> float | None:
+    """Return how far two drones are apart at their first frames, by the truth."""
+    starts = []
+    for planned in (a, b):
+        truth = planned.drone.truth
+        start = truth.pose_at(planned.drone.frames[0].at_ns) if truth else None
+        if start is None:
+            return None
+        starts.append(start.translation)
+    distance_m = float(np.linalg.norm(starts[0] - starts[1]))
+    return distance_m if distance_m > 0.0 else None

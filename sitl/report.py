@@ -1,0 +1,147 @@
+"""What a flight comes to: ``report.json``, and ``report.html`` for people.
+
+Terms beyond ``sitl.evaluation``'s:
+
+* ``localized_share``: frames whose pose reached the autopilot, of all frames.
+* ``frames_localized``, ``frames_refused``, ``frames_dropped``: what the daemon's
+  log says of each frame; ``unaccounted`` is what it says nothing about.
+* ``latency_ms``: from a frame's arrival in the daemon to its outcome, of frames
+  that were looked at. A drone's first frame waits for the first map by design
+  and is told apart as ``first_frame_ms``.
+* ``landmarks``: median number of landmarks a sent pose rests on.
+* ``peer_bytes_per_s``: sent to the other drones, per second of recording time.
+* ``map``: the leader's last revision; ``revisions`` counts all of them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sitl.report_page import page
+from sitl.result import DroneResult, FlightResult
+
+
+def write_report(
+    result: FlightResult,
+    out: Path,
+    *,
+    start_s: float,
+    flight_s: float,
+    late_ms: float | None,
+) -> dict[str, Any]:
+    """Write ``report.json`` and ``report.html`` into ``out`` and return the former's content.
+
+    Args:
+        result: the flight.
+        out: an existing folder.
+        start_s: wall time from the first frame to the first map.
+        flight_s: wall time of the rest.
+        late_ms: p99 of how much later than due the harness handed out frames;
+            None when it kept no pace.
+    """
+    report = report_of(result)
+    report["wall"] = _rounded({"start_s": start_s, "flight_s": flight_s, "late_p99_ms": late_ms})
+    text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
+    (out / "report.json").write_text(text + "\n", encoding="utf-8")
+    (out / "report.html").write_text(page(result, report), encoding="utf-8")
+    return report
+
+
+def report_of(result: FlightResult) -> dict[str, Any]:
+    """Return a flight's report as JSON knows it: no NaN, what is not known is null."""
+    plan = result.plan
+    last_map = result.maps[-1] if result.maps else None
+    duration_s = (plan.ends_at_ns - plan.starts_at_ns) * 1e-9
+    options = plan.options
+    report = {
+        "recording": plan.recording.name,
+        "pipeline": "default",
+        "options": {
+            "speed": "max" if math.isinf(options.speed) else options.speed,
+            "drones": [drone.name for drone in plan.drones],
+            "leader": plan.leader,
+            "known_distances_m": {
+                f"{_name(result, a)}:{_name(result, b)}": distance_m
+                for a, b, distance_m in plan.known_distances
+            },
+            "attitude": "replayed" if options.attitude else "from truth with noise",
+            "seed": options.seed,
+            "start_timeout_s": options.start_timeout_s,
+            "settings": {".".join(setting.path): setting.value for setting in options.settings},
+        },
+        "drones": {drone.name: _drone(drone, duration_s) for drone in result.drones},
+        "map": {
+            "revisions": len({row.revision for row in result.maps}),
+            "landmarks": last_map.landmarks if last_map else 0,
+            "bytes": last_map.bytes if last_map else 0,
+            "keyframes": last_map.keyframes if last_map else 0,
+        },
+        "events": [
+            {"at_s": event.at_s, "drone": event.drone, "kind": event.kind, "reason": event.reason}
+            for event in result.events
+        ],
+        "duration_s": duration_s,
+    }
+    # Options stay exact: whoever repeats the flight needs all of their digits.
+    return {**_rounded(report), "options": report["options"]}
+
+
+def _drone(drone: DroneResult, duration_s: float) -> dict[str, Any]:
+    scores, log, summary = drone.scores, drone.log, drone.log.summary
+    first = [f.latency_ms for f in log.frames if f.sequence == 0]
+    looked_at = [
+        frame.latency_ms
+        for frame in log.frames
+        if frame.sequence > 0 and frame.latency_ms is not None and frame.outcome != "dropped"
+    ]
+    inliers = [frame.inliers for frame in log.frames if frame.outcome == "localized"]
+    sent = summary.peer_bytes_sent if summary else None
+    return {
+        "frames": drone.n_frames,
+        "localized_share": drone.n_localized / drone.n_frames,
+        "frames_localized": log.count("localized"),
+        "frames_refused": log.count("refused"),
+        "frames_dropped": log.count("dropped"),
+        "unaccounted": drone.unaccounted,
+        "refusals": log.refusals(),
+        "ate_m": scores.ate_m if scores else None,
+        "ate_aligned_m": scores.ate_aligned_m if scores else None,
+        "worst_m": scores.worst_m if scores else None,
+        "rmse_m": dict(zip("xyz", scores.rmse_m if scores else (None,) * 3, strict=True)),
+        "yaw_rmse_deg": scores.yaw_rmse_deg if scores else None,
+        "within_3_sigma_share": scores.within_3_sigma_share if scores else None,
+        "within_3_sigma_or_10cm_share": scores.within_3_sigma_or_10cm_share if scores else None,
+        "nees_median": scores.nees_median if scores else None,
+        "latency_ms": {"p50": _percentile(looked_at, 50.0), "p99": _percentile(looked_at, 99.0)},
+        "first_frame_ms": first[0] if first else None,
+        "cpu_share": summary.cpu_s / summary.wall_s if summary and summary.wall_s > 0 else None,
+        "resident_mb": summary.resident_mb if summary else None,
+        "peer_bytes_per_s": sent / duration_s if sent is not None and duration_s > 0 else None,
+        "peer_bytes_sent": sent,
+        "landmarks": float(np.median(inliers)) if inliers else 0,
+    }
+
+
+def _name(result: FlightResult, system_id: int) -> str:
+    return next(d.name for d in result.plan.drones if d.system_id == system_id)
+
+
+def _percentile(values: Sequence[float], percent: float) -> float | None:
+    return float(np.percentile(values, percent)) if values else None
+
+
+def _rounded(value: Any) -> Any:
+    """Return JSON-like data with floats to six decimals and what is not finite as null."""
+    if isinstance(value, dict):
+        return {key: _rounded(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(inner) for inner in value]
+    if isinstance(value, float):
+        return round(value, 6) if math.isfinite(value) else None
+    return value

@@ -1,0 +1,234 @@
+"""A flight's outcome, gathered from what it left on disk and compared with the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.evaluation import (
+    Estimates,
+    PoseErrors,
+    Scores,
+    pose_errors,
+    ref_from_world,
+    scores,
+)
+from sitl.flight_log import FlightLog, MapRow, read_flight_log, read_received
+from sitl.plan import FlightPlan, PlannedDrone
+from sitl.processes import FlightError
+from vcl_companion.errors import WireError
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.recording import NED_FROM_REFERENCE
+from vcl_companion.wire.map_codec import decode_map
+
+# A pose is about a frame: usec cuts its instant to a microsecond, and a clock
+# that is carried over twice may cost a few more.
+_SAME_FRAME_NS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened in a flight; ``at_s`` counts from the first frame."""
+
+    at_s: float
+    drone: str
+    kind: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class DroneResult:
+    """One drone's flight.
+
+    Attributes:
+        name: ``mavN``.
+        frames_at_ns: (F,) instants of its frames.
+        truth: F true poses in the recording's NED; None where not known.
+        estimates: T poses its autopilot received, at their frames' own instants.
+        frame_of: (T,) the frame each is about, -1 when it fits none.
+        log: its daemon's log.
+        errors: estimates against truth; None without truth or alignment.
+        scores: those errors in numbers.
+    """
+
+    name: str
+    frames_at_ns: NDArray[np.int64]
+    truth: tuple[Pose | None, ...]
+    estimates: Estimates
+    frame_of: NDArray[np.int64]
+    log: FlightLog
+    errors: PoseErrors | None
+    scores: Scores | None
+
+    @property
+    def n_frames(self) -> int:
+        """Frames of the recording."""
+        return len(self.frames_at_ns)
+
+    @property
+    def n_localized(self) -> int:
+        """Frames whose pose reached the autopilot."""
+        return len(set(self.frame_of[self.frame_of >= 0].tolist()))
+
+    @property
+    def unaccounted(self) -> int:
+        """Frames that the daemon's log says nothing about, or more than one thing."""
+        rows = [frame.sequence for frame in self.log.frames]
+        twice = len(rows) - len(set(rows))
+        return len(set(range(self.n_frames)) ^ set(rows)) + twice
+
+
+@dataclass(frozen=True, eq=False)
+class FlightResult:
+    """A whole flight.
+
+    Attributes:
+        plan: what was to be flown.
+        drones: in the plan's order.
+        ref_from_world: carries ``world`` into the recording's NED; None when the
+            leader has no estimate with a truth.
+        maps: the leader's map revisions in the order they came into use.
+        points_ref_m: (N, 3) landmarks of the last map, where ``ref_from_world``
+            puts them, else in ``world``.
+        events: of all drones and the harness, in time order.
+    """
+
+    plan: FlightPlan
+    drones: tuple[DroneResult, ...]
+    ref_from_world: Pose | None
+    maps: tuple[MapRow, ...]
+    points_ref_m: Array
+    events: tuple[Event, ...]
+
+
+def gather(plan: FlightPlan, out: Path, events: Iterable[Event] = ()) -> FlightResult:
+    """Read what daemons and stand-ins wrote under ``out``, and compare it with the truth.
+
+    Args:
+        plan: the flight.
+        out: its output folder.
+        events: what the harness itself has to say.
+
+    Raises:
+        FlightError: a file is missing or broken; names it.
+    """
+    logs = {d.name: read_flight_log(out / "run" / d.name / "flight.jsonl") for d in plan.drones}
+    truths = {d.name: _truth_at_frames(d) for d in plan.drones}
+    heard = {
+        d.name: _on_frames(d, read_received(out / d.name / "received.jsonl", d.system_id))
+        for d in plan.drones
+    }
+    alignment = _alignment(*heard[plan.leader], truths[plan.leader])
+    drones = tuple(
+        _drone_result(d, truths[d.name], *heard[d.name], logs[d.name], alignment)
+        for d in plan.drones
+    )
+    maps = logs[plan.leader].maps or next((log.maps for log in logs.values() if log.maps), ())
+    points = _map_points(out / "run" / plan.leader / "maps", maps)
+    said = [*events, *_logged(plan, logs), *(e for d in drones for e in _doubts(d))]
+    if alignment is None and any(d.truth and any(d.truth) for d in drones):
+        why = f"{plan.leader} has no estimate with a truth: nothing is compared with the truth"
+        said.append(Event(0.0, plan.leader, "harness", why))
+    return FlightResult(
+        plan=plan,
+        drones=drones,
+        ref_from_world=alignment,
+        maps=maps,
+        points_ref_m=points if alignment is None else alignment.apply(points),
+        events=tuple(sorted(said, key=lambda event: event.at_s)),
+    )
+
+
+def _drone_result(
+    planned: PlannedDrone,
+    truth: tuple[Pose | None, ...],
+    estimates: Estimates,
+    frame_of: NDArray[np.int64],
+    log: FlightLog,
+    alignment: Pose | None,
+) -> DroneResult:
+    errors = None
+    if alignment is not None:
+        true = tuple(truth[n] if n >= 0 else None for n in frame_of.tolist())
+        errors = pose_errors(estimates, true, alignment)
+    axes = NED_FROM_REFERENCE[planned.drone.sensor.reference_axes].T
+    return DroneResult(
+        name=planned.name,
+        frames_at_ns=planned.frames_at_ns,
+        truth=truth,
+        estimates=estimates,
+        frame_of=frame_of,
+        log=log,
+        errors=errors if errors is not None and len(errors.at_ns) else None,
+        scores=scores(errors, axes) if errors is not None else None,
+    )
+
+
+def _truth_at_frames(planned: PlannedDrone) -> tuple[Pose | None, ...]:
+    truth = planned.drone.truth
+    return tuple(truth.pose_at(f.at_ns) if truth else None for f in planned.drone.frames)
+
+
+def _on_frames(planned: PlannedDrone, received: Estimates) -> tuple[Estimates, NDArray[np.int64]]:
+    """Give estimates the exact instants of the frames that they are about."""
+    frames = planned.frames_at_ns
+    after = np.clip(np.searchsorted(frames, received.at_ns), 1, max(1, len(frames) - 1))
+    before = after - 1
+    after = np.minimum(after, len(frames) - 1)
+    closer = np.abs(frames[after] - received.at_ns) < np.abs(received.at_ns - frames[before])
+    nearest = np.where(closer, after, before)
+    fits = np.abs(frames[nearest] - received.at_ns) <= _SAME_FRAME_NS
+    at_ns = np.where(fits, frames[nearest], received.at_ns)
+    exact = Estimates(at_ns, received.world_from_body, received.covariances)
+    return exact, np.where(fits, nearest, -1)
+
+
+def _alignment(
+    estimates: Estimates, frame_of: NDArray[np.int64], truth: tuple[Pose | None, ...]
+) -> Pose | None:
+    """Return ref_from_world by the leader's first estimate that has a truth."""
+    for estimate, n in zip(estimates.world_from_body, frame_of.tolist(), strict=True):
+        true = truth[n] if n >= 0 else None
+        if true is not None:
+            return ref_from_world(true, estimate)
+    return None
+
+
+def _map_points(folder: Path, maps: Sequence[MapRow]) -> Array:
+    """Return the (N, 3) landmarks of the last map, world frame, m."""
+    if not maps:
+        return np.empty((0, 3))
+    path = folder / f"{maps[-1].revision}.vclmap"
+    try:
+        return decode_map(path.read_bytes()).points_world
+    except OSError as error:
+        raise FlightError(f"{path}: {error.strerror}") from error
+    except WireError as error:
+        raise FlightError(f"{path}: {error}") from error
+
+
+def _logged(plan: FlightPlan, logs: dict[str, FlightLog]) -> list[Event]:
+    return [
+        Event((row.at_ns - plan.starts_at_ns) * 1e-9, name, row.event, row.reason or "")
+        for name, log in logs.items()
+        for row in log.events
+    ]
+
+
+def _doubts(drone: DroneResult) -> list[Event]:
+    """Return what does not add up, so that nobody has to find it."""
+    out = []
+    if drone.unaccounted:
+        out.append(f"{drone.unaccounted} of {drone.n_frames} frames are not accounted for")
+    strangers = int(np.sum(drone.frame_of < 0))
+    if strangers:
+        out.append(f"{strangers} poses carry the time of no frame")
+    logged = drone.log.count("localized")
+    if logged != drone.n_localized:
+        out.append(f"{logged} frames localized by the log, {drone.n_localized} poses received")
+    return [Event(0.0, drone.name, "harness", text) for text in out]

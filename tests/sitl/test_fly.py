@@ -1,0 +1,240 @@
+"""Whole flights from the command line: real daemons, real stand-ins, real sockets."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from sitl.__main__ import main
+from vcl_companion.recording import Description, RecordingWriter, read_recording
+from vcl_companion.recording.tum import read_tum
+
+ROOT = Path(__file__).parents[2]
+DEMO = ROOT / "sitl" / "recordings" / "demo"
+N_FRAMES = 4
+DRONES = ("mav0", "mav1", "mav2")
+TIMEOUT_S = 60.0
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "sitl", "fly", *map(str, arguments)]
+
+
+def sitl_fly(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command(*arguments),
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+    )
+
+
+def start_of_demo(path: Path) -> Path:
+    """Write the first frames of the demo as a recording of its own."""
+    demo = read_recording(DEMO)
+    description = Description("start of demo", 5.0, demo.leader, demo.known_distances)
+    with RecordingWriter(path, description) as writer:
+        for drone in demo.drones:
+            writer.add_drone(drone.name, drone.sensor, drone.truth)
+            for frame in drone.frames[:N_FRAMES]:
+                writer.add_file(drone.name, frame.at_ns, frame.path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return start_of_demo(tmp_path_factory.mktemp("a recording") / "start")
+
+
+@pytest.fixture(scope="module")
+def flown(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output folder of one flight as fast as the daemons keep up."""
+    out = tmp_path_factory.mktemp("flown") / "out put"
+    done = sitl_fly(recording, "--out", out, "--speed", "max")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert str(out / "report.html") in done.stdout
+    assert "\x1b" not in done.stdout
+    return out
+
+
+def report_in(out: Path) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads((out / "report.json").read_text())
+    return report
+
+
+def poses_received(out: Path, drone: str) -> list[dict[str, Any]]:
+    """Return the fields of every VISION_POSITION_ESTIMATE an autopilot heard."""
+    lines = map(json.loads, (out / drone / "received.jsonl").read_text().splitlines())
+    return [line["fields"] for line in lines if line["type"] == "VISION_POSITION_ESTIMATE"]
+
+
+def test_a_flight_accounts_for_every_frame_and_is_close_to_the_truth(flown: Path) -> None:
+    report = report_in(flown)
+    assert set(report["drones"]) == set(DRONES)
+    for name in DRONES:
+        drone = report["drones"][name]
+        assert drone["frames"] == N_FRAMES
+        outcomes = [drone[f"frames_{how}"] for how in ("localized", "refused", "dropped")]
+        assert sum(outcomes) == N_FRAMES
+        assert drone["unaccounted"] == drone["frames_dropped"] == 0
+        assert drone["localized_share"] == 1.0
+        assert 0.0 <= drone["ate_m"] <= 0.15
+        assert 0.0 < drone["latency_ms"]["p50"] <= drone["latency_ms"]["p99"] < 2000.0
+    assert report["map"]["landmarks"] >= 50
+    assert [event for event in report["events"] if event["kind"] == "harness"] == []
+
+
+def test_a_flight_leaves_the_files_that_the_format_promises(flown: Path, recording: Path) -> None:
+    frames = {d.name: [f.at_ns for f in d.frames] for d in read_recording(recording).drones}
+    for name in DRONES:
+        assert [row[0] for row in read_tum(flown / name / "truth.tum")] == frames[name]
+        estimates = read_tum(flown / name / "estimate.tum")
+        assert [row[0] for row in estimates] == frames[name]
+        covariances = (flown / name / "covariance.csv").read_text().splitlines()
+        assert len(covariances) == 1 + len(estimates)
+        assert all(len(row.split(",")) == 22 for row in covariances)
+    first, true = (read_tum(flown / "mav0" / f"{kind}.tum")[0][1] for kind in ("estimate", "truth"))
+    assert first.translation == pytest.approx(true.translation, abs=1e-6)
+    assert (flown / "report.html").stat().st_size > 50_000
+
+
+def test_nothing_of_the_truth_reaches_a_daemon(
+    flown: Path, recording: Path, tmp_path: Path
+) -> None:
+    """With the truth files gone, the same attitude gives the same poses, bit for bit."""
+    blind = shutil.copytree(recording, tmp_path / "blind")
+    for name in DRONES:
+        shutil.rmtree(blind / name / "state_groundtruth_estimate0")
+    distance_m = report_in(flown)["options"]["known_distances_m"]
+    known = [f"--known-distance={pair}={metres!r}" for pair, metres in distance_m.items()]
+    out = tmp_path / "again"
+    done = sitl_fly(blind, "--out", out, "--speed", "max", "--attitude", flown, *known)
+    assert done.returncode == 0, done.stderr
+    for name in DRONES:
+        before, after = poses_received(flown, name), poses_received(out, name)
+        assert len(before) == N_FRAMES
+        assert after == before
+        assert report_in(out)["drones"][name]["ate_m"] is None
+        assert not (out / name / "truth.tum").exists()
+        attitudes = [(folder / name / "attitude.csv").read_bytes() for folder in (flown, out)]
+        assert attitudes[0] == attitudes[1]
+
+
+@contextmanager
+def under_way(recording: Path, out: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+    """Start a flight and hand it over when its first frames are out and all processes run."""
+    # A test run in the background ignores Ctrl-C; what it starts must not inherit that.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    with subprocess.Popen(
+        command(recording, "--out", out, *options),
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        bufsize=1,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    ) as flight:
+        signal.signal(signal.SIGINT, before)
+        try:
+            assert flight.stdout is not None
+            stages = iter(flight.stdout.readline, "")
+            assert any(stage.startswith("making the first map") for stage in stages)
+            yield flight
+        finally:
+            flight.kill()
+
+
+def processes_of(out: Path) -> dict[str, int]:
+    """Return a pidfd of every process of a flight, by drone and kind."""
+    files = sorted((out / "run").glob("mav*/*.pid"))
+    return {f"{f.parent.name} {f.stem}": os.pidfd_open(int(f.read_text())) for f in files}
+
+
+def assert_all_end(processes: dict[str, int]) -> None:
+    """Every process is gone within a moment; a pidfd can be read when its process is."""
+    for name, pidfd in processes.items():
+        assert select.select([pidfd], [], [], 10.0)[0], f"{name} still runs"
+        os.close(pidfd)
+
+
+def test_a_crash_of_one_ends_all_and_is_named(recording: Path, tmp_path: Path) -> None:
+    with under_way(recording, tmp_path / "out") as flight:
+        processes = processes_of(tmp_path / "out")
+        assert len(processes) == 6
+        signal.pidfd_send_signal(processes["mav1 daemon"], signal.SIGKILL)
+        _, errors = flight.communicate(timeout=TIMEOUT_S)
+    assert flight.returncode == 1
+    assert errors.startswith("sitl: daemon of mav1 was ended by SIGKILL")
+    assert errors.count("\n") == 1
+    assert_all_end(processes)
+
+
+@pytest.mark.parametrize(
+    ("sent", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)]
+)
+def test_no_process_is_left_however_a_flight_is_ended(
+    recording: Path, tmp_path: Path, sent: signal.Signals, status: int
+) -> None:
+    with under_way(recording, tmp_path / "out") as flight:
+        processes = processes_of(tmp_path / "out")
+        flight.send_signal(sent)
+        _, errors = flight.communicate(timeout=TIMEOUT_S)
+    assert flight.returncode == status
+    assert "Traceback" not in errors
+    assert_all_end(processes)
+
+
+def test_a_daemon_that_does_not_start_says_why(recording: Path, tmp_path: Path) -> None:
+    done = sitl_fly(recording, "--out", tmp_path / "out", "--set", "camera.sorce='oak'")
+    assert done.returncode == 1
+    assert "ended with exit code 2" in done.stderr
+    assert "nearest valid key is camera.source" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_input_that_cannot_be_used_is_one_line_and_status_2(
+    recording: Path, tmp_path: Path
+) -> None:
+    broken = shutil.copytree(recording, tmp_path / "broken")
+    next((broken / "mav1" / "cam0" / "data").iterdir()).unlink()
+    out = tmp_path / "out"
+    for arguments, message in (
+        ((tmp_path / "nowhere",), "no such folder"),
+        ((broken,), "mav1"),
+        ((recording, "--drones", "mav9"), "no 'mav9'"),
+        ((recording, "--set", "log.level=debug"), "a string needs quotes"),
+        ((recording, "--attitude", tmp_path), "no mav0/attitude.csv"),
+    ):
+        done = CliRunner().invoke(main, ["fly", *map(str, arguments), "--out", str(out)])
+        assert done.exit_code == 2, arguments
+        assert message in done.stderr
+        assert done.stderr.startswith("sitl: ")
+        assert done.stderr.count("\n") == 1
+        assert not out.exists()
+
+
+def test_two_of_three_fly_against_the_clock(recording: Path, tmp_path: Path) -> None:
+    """Nobody waits for a daemon then: a frame may be dropped, but never be forgotten."""
+    out = tmp_path / "out"
+    done = sitl_fly(recording, "--out", out, "--speed", "4", "--drones", "mav0,mav1")
+    assert done.returncode == 0, done.stderr
+    report = report_in(out)
+    assert list(report["drones"]) == ["mav0", "mav1"]
+    assert all(drone["unaccounted"] == 0 for drone in report["drones"].values())
+    assert report["wall"]["flight_s"] >= (N_FRAMES - 1) * 0.2 / 4
+    assert not (out / "mav2").exists()

@@ -1,0 +1,144 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sitl.out_folder import prepare_folder
+from sitl.plan import FlyOptions, Setting, parse_known_distance, parse_setting, plan_flight
+from tests.sitl.flights import Flight, at_ns, ned_from_body, write_recording
+from vcl_companion.errors import ConfigError
+from vcl_companion.recording import KnownPair, Recording, read_recording
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Recording:
+    return read_recording(write_recording(tmp_path / "three", Flight(n_frames=2, n_drones=3)))
+
+
+def without_truth(recording: Recording) -> Recording:
+    return replace(recording, drones=tuple(replace(d, truth=None) for d in recording.drones))
+
+
+def test_all_fly_and_ids_are_their_places(recording: Recording) -> None:
+    plan = plan_flight(recording, FlyOptions())
+    assert [(d.name, d.system_id) for d in plan.drones] == [("mav0", 1), ("mav1", 2), ("mav2", 3)]
+    assert plan.leader == "mav0"
+    assert plan.known_distances == ((1, 2, 2.0),)
+    assert plan.starts_at_ns == at_ns(0, 0)
+    assert plan.ends_at_ns == at_ns(2, 1)
+
+
+def test_a_subset_keeps_its_ids_and_gets_a_leader(recording: Recording) -> None:
+    options = FlyOptions(drones=("mav2", "mav1"), known_distances=(KnownPair("mav1", "mav2", 4.0),))
+    plan = plan_flight(recording, options)
+    assert [(d.name, d.system_id) for d in plan.drones] == [("mav1", 2), ("mav2", 3)]
+    assert plan.leader == "mav1"
+    assert plan.known_distances == ((2, 3, 4.0),)
+
+
+def test_a_distance_without_metres_is_the_truth_s_at_the_start(recording: Recording) -> None:
+    options = FlyOptions(known_distances=(KnownPair("mav0", "mav2"),))
+    apart = ned_from_body(2, 0).translation - ned_from_body(0, 0).translation
+    ((a, b, distance_m),) = plan_flight(recording, options).known_distances
+    assert (a, b) == (1, 3)
+    assert distance_m == pytest.approx(np.linalg.norm(apart), abs=1e-9)
+
+
+def test_an_earlier_flight_s_attitude_needs_no_truth(recording: Recording, tmp_path: Path) -> None:
+    for n in range(3):
+        (tmp_path / "earlier" / f"mav{n}").mkdir(parents=True)
+        (tmp_path / "earlier" / f"mav{n}" / "attitude.csv").touch()
+    options = FlyOptions(attitude=tmp_path / "earlier")
+    plan = plan_flight(without_truth(recording), options)
+    assert [d.attitude_path for d in plan.drones] == [
+        (tmp_path / "earlier" / f"mav{n}" / "attitude.csv").resolve() for n in range(3)
+    ]
+
+
+def test_what_does_not_fit_says_what_would(recording: Recording, tmp_path: Path) -> None:
+    def message(options: FlyOptions, flown: Recording = recording) -> str:
+        with pytest.raises(ConfigError) as raised:
+            plan_flight(flown, options)
+        return str(raised.value)
+
+    assert "no 'mav7' (mav0, mav1, mav2)" in message(FlyOptions(drones=("mav7",)))
+    assert "'mav2' does not fly" in message(
+        FlyOptions(drones=("mav0", "mav1"), known_distances=(KnownPair("mav0", "mav2", 1.0),))
+    )
+    assert "give --known-distance mav0:mav2=METRES" in message(FlyOptions(drones=("mav0", "mav2")))
+    assert "give --attitude DIR" in message(FlyOptions(), without_truth(recording))
+    assert "no mav0/attitude.csv" in message(FlyOptions(attitude=tmp_path))
+    for n in range(3):
+        (tmp_path / "earlier" / f"mav{n}").mkdir(parents=True)
+        (tmp_path / "earlier" / f"mav{n}" / "attitude.csv").touch()
+    options = FlyOptions(
+        attitude=tmp_path / "earlier", known_distances=(KnownPair("mav0", "mav1"),)
+    )
+    assert "give --known-distance mav0:mav1=METRES" in message(options, without_truth(recording))
+
+
+@pytest.mark.parametrize(
+    "options", [{"speed": 0.0}, {"speed": float("nan")}, {"start_timeout_s": 0.0}, {"seed": -1}]
+)
+def test_options_have_bounds(options: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match="must"):
+        FlyOptions(**options)  # type: ignore[arg-type]  # the point of the test
+
+
+def test_a_known_distance_on_the_command_line() -> None:
+    assert parse_known_distance("mav0:mav1=1.63") == KnownPair("mav0", "mav1", 1.63)
+    assert parse_known_distance("mav0:mav1") == KnownPair("mav0", "mav1", None)
+    for text in ("mav0", "mav0:mav1=far", "mav0:mav0=1", "mav0:mav1=-1", "mav0:mav1=nan", ":=1"):
+        with pytest.raises(ConfigError, match="like mav0:mav1"):
+            parse_known_distance(text)
+
+
+def test_a_setting_on_the_command_line() -> None:
+    assert parse_setting("log.level='debug'") == Setting(("log", "level"), "debug")
+    assert parse_setting("a.b.c = [1, 2.5]") == Setting(("a", "b", "c"), [1, 2.5])
+    for text in ("log.level", "log.level=debug", "=1", "a..b=1", "a=1\nb=2", "a b=1"):
+        with pytest.raises(ConfigError, match="--set"):
+            parse_setting(text)
+
+
+def test_the_output_folder_is_cleared_of_flights_and_of_nothing_else(
+    recording: Recording, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    prepare_folder(out, plan_flight(recording, FlyOptions()))
+    for name in ("estimate.tum", "notes.txt"):
+        (out / "mav2" / name).touch()
+    for name in ("report.json", "mine.txt", "run/mav1/daemon.stderr"):
+        (out / name).touch()
+    fewer = FlyOptions(drones=("mav0", "mav1"))
+    prepare_folder(out, plan_flight(recording, fewer))
+    left = sorted(str(p.relative_to(out)) for p in out.rglob("*") if p.is_file())
+    assert left == ["mav2/notes.txt", "mine.txt", "run/flight.json"]
+    assert (out / "run" / "mav1" / "maps").is_dir()
+    assert not (out / "run" / "mav2").exists()
+
+
+def test_a_folder_of_something_else_is_not_touched(recording: Recording, tmp_path: Path) -> None:
+    plan = plan_flight(recording, FlyOptions())
+    (tmp_path / "home" / "run").mkdir(parents=True)
+    with pytest.raises(ConfigError, match="something other than a flight"):
+        prepare_folder(tmp_path / "home", plan)
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="is a file"):
+        prepare_folder(tmp_path / "file", plan)
+    with pytest.raises(ConfigError, match="cannot be written"):
+        prepare_folder(tmp_path / "file" / "below", plan)
+
+
+def test_results_do_not_overwrite_the_attitude_they_are_made_of(
+    recording: Recording, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    prepare_folder(out, plan_flight(recording, FlyOptions()))
+    for n in range(3):
+        (out / f"mav{n}" / "attitude.csv").touch()
+    plan = plan_flight(recording, FlyOptions(attitude=out))
+    with pytest.raises(ConfigError, match="the same folder"):
+        prepare_folder(out, plan)
+    assert (out / "mav0" / "attitude.csv").exists()

@@ -1,0 +1,311 @@
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sitl.processes import FlightError
+from sitl.report import report_of, write_report
+from sitl.result import FlightResult, gather
+from sitl.trajectory_files import write_trajectories
+from tests.sitl.flights import (
+    NED_FROM_WORLD,
+    PERIOD_NS,
+    SIGMAS,
+    START_NS,
+    Flight,
+    at_ns,
+    leave_behind,
+    ned_from_body,
+)
+from vcl_companion.recording import NED_FROM_REFERENCE, read_recording
+from vcl_companion.recording.tum import read_tum
+
+
+def reported(tmp_path: Path, flight: Flight) -> tuple[FlightResult, dict[str, Any], Path]:
+    plan, out = leave_behind(tmp_path, flight)
+    result = gather(plan, out)
+    write_trajectories(result, out)
+    return result, json.loads(json.dumps(report_of(result), allow_nan=False)), out
+
+
+def page_of(result: FlightResult, out: Path) -> str:
+    """Write the report and return its page; report.json must say what ``report_of`` says."""
+    written = write_report(result, out, start_s=1.0, flight_s=2.0, late_ms=1.5)
+    report = json.loads((out / "report.json").read_text())
+    assert report == written == {**report_of(result), "wall": report["wall"]}
+    return (out / "report.html").read_text()
+
+
+def test_a_perfect_flight_lies_on_its_truth(tmp_path: Path) -> None:
+    result, report, out = reported(tmp_path, Flight())
+    assert result.ref_from_world is not None
+    assert np.allclose(result.ref_from_world.matrix(), NED_FROM_WORLD.matrix(), atol=1e-9)
+    for name in ("mav0", "mav1"):
+        assert (out / name / "estimate.tum").read_text() == (out / name / "truth.tum").read_text()
+        drone = report["drones"][name]
+        assert drone["ate_m"] == 0.0
+        assert drone["within_3_sigma_share"] == 1.0
+        assert drone["localized_share"] == 1.0
+        assert drone["unaccounted"] == 0
+    assert [event["kind"] for event in report["events"]] == ["map", "map"]
+
+
+def test_the_report_has_exactly_the_keys_that_others_read(tmp_path: Path) -> None:
+    _, report, _ = reported(tmp_path, Flight(refused=frozenset({("mav1", 5)})))
+    assert {"recording", "pipeline", "options", "drones", "map", "events"} <= set(report)
+    assert set(report["drones"]) == {"mav0", "mav1"}
+    keys = {
+        "frames", "localized_share", "ate_m", "ate_aligned_m", "rmse_m", "yaw_rmse_deg",
+        "within_3_sigma_share", "nees_median", "latency_ms", "frames_dropped", "cpu_share",
+        "resident_mb", "peer_bytes_per_s", "landmarks", "refusals",
+    }  # fmt: skip
+    drone = report["drones"]["mav1"]
+    assert keys <= set(drone)
+    assert set(drone["rmse_m"]) == {"x", "y", "z"}
+    assert set(drone["latency_ms"]) == {"p50", "p99"}
+    assert {"revisions", "landmarks", "bytes"} <= set(report["map"])
+    assert set(report["events"][0]) == {"at_s", "drone", "kind", "reason"}
+    assert report["pipeline"] == "default"
+
+
+def test_numbers_are_those_of_the_logs(tmp_path: Path) -> None:
+    flight = Flight(
+        n_frames=12, refused=frozenset({("mav1", 5), ("mav1", 6)}), dropped=frozenset({("mav1", 9)})
+    )
+    _, report, out = reported(tmp_path, flight)
+    drone = report["drones"]["mav1"]
+    assert drone["frames"] == 12
+    assert drone["localized_share"] == pytest.approx(9 / 12)
+    assert (drone["frames_localized"], drone["frames_refused"]) == (9, 2)
+    assert (drone["frames_dropped"], drone["unaccounted"]) == (1, 0)
+    assert drone["refusals"] == {"9 of 30 <landmarks>": 2}
+    # The first frame's 900 ms are the wait for the map; of the others 21..31 but the dropped 29.
+    assert drone["latency_ms"]["p50"] == pytest.approx(25.5)
+    assert 30.5 < drone["latency_ms"]["p99"] < 31.0
+    assert drone["first_frame_ms"] == 900.0
+    assert drone["cpu_share"] == pytest.approx(0.5)
+    assert drone["peer_bytes_per_s"] == pytest.approx(4400 / (11 * PERIOD_NS * 1e-9 + 0.003))
+    assert drone["landmarks"] == 96.0
+    size = len(next((out / "run" / "mav0" / "maps").iterdir()).read_bytes())
+    assert report["map"] == {"revisions": 1, "landmarks": 200, "bytes": size, "keyframes": 1}
+
+
+def test_errors_come_out_as_they_were_put_in(tmp_path: Path) -> None:
+    """White errors of the stated sigmas, but for the leader's first, which is the origin."""
+    rng = np.random.default_rng(11)
+    errors = {(f"mav{n}", k): rng.normal(size=6) * SIGMAS for n in range(2) for k in range(150)}
+    errors["mav0", 0] = np.zeros(6)
+    flight = Flight(n_frames=150, error=lambda name, k: errors[name, k])
+    _, report, _ = reported(tmp_path, flight)
+    for name in ("mav0", "mav1"):
+        drone = report["drones"][name]
+        put_in = np.array([errors[name, k] for k in range(150)])
+        ate_m = float(np.sqrt(np.mean(np.sum(put_in[:, :3] ** 2, axis=1))))
+        assert drone["ate_m"] == pytest.approx(ate_m, abs=2e-6)
+        assert drone["yaw_rmse_deg"] == pytest.approx(
+            np.degrees(np.sqrt(np.mean(put_in[:, 5] ** 2))), abs=1e-3
+        )
+        assert 0.9 * ate_m < drone["ate_aligned_m"] < ate_m
+        assert 4.0 < drone["nees_median"] < 6.8
+        assert 0.96 < drone["within_3_sigma_share"] <= 1.0
+
+
+def test_timestamps_are_the_frames_own_to_the_nanosecond(tmp_path: Path) -> None:
+    """Usec cut them to the microsecond; a float of epoch seconds would lose more."""
+    _, _, out = reported(tmp_path, Flight())
+    rows = read_tum(out / "mav1" / "estimate.tum")
+    assert [row[0] for row in rows] == [at_ns(1, k) for k in range(12)]
+    first = (out / "mav1" / "covariance.csv").read_text().splitlines()[1].split(",")
+    assert first[0] == str(at_ns(1, 0))
+    assert [float(cell) for cell in first[1:]] == pytest.approx(
+        np.diag(SIGMAS**2)[np.triu_indices(6)].tolist()
+    )
+    assert len(first) == 22
+
+
+def test_poses_go_out_in_the_recording_s_own_axes(tmp_path: Path) -> None:
+    _, report, out = reported(tmp_path, Flight(axes="ENU"))
+    assert report["drones"]["mav1"]["ate_m"] < 1e-6
+    enu_from_ned = NED_FROM_REFERENCE["ENU"].T
+    for name in ("estimate.tum", "truth.tum"):
+        _, pose = read_tum(out / "mav1" / name)[7]
+        truth = ned_from_body(1, 7)
+        assert pose.translation == pytest.approx(enu_from_ned @ truth.translation, abs=1e-6)
+        assert np.allclose(pose.rotation, enu_from_ned @ truth.rotation, atol=1e-6)
+
+
+def test_without_truth_estimates_stay_in_world_and_errors_are_unknown(tmp_path: Path) -> None:
+    result, report, out = reported(tmp_path, Flight(with_truth=False))
+    assert result.ref_from_world is None
+    drone = report["drones"]["mav0"]
+    assert [drone[k] for k in ("ate_m", "ate_aligned_m", "yaw_rmse_deg", "nees_median")] == [
+        None
+    ] * 4
+    assert drone["rmse_m"] == {"x": None, "y": None, "z": None}
+    assert drone["localized_share"] == 1.0
+    assert not (out / "mav0" / "truth.tum").exists()
+    _, pose = read_tum(out / "mav0" / "estimate.tum")[3]
+    in_world = NED_FROM_WORLD.inverse() @ ned_from_body(0, 3)
+    assert pose.translation == pytest.approx(in_world.translation, abs=1e-8)
+    assert "No truth to compare with" in page_of(result, out)
+
+
+def test_a_leader_without_a_pose_leaves_nothing_to_compare(tmp_path: Path) -> None:
+    everything = frozenset(("mav0", k) for k in range(12))
+    result, report, _ = reported(tmp_path, Flight(refused=everything))
+    assert result.ref_from_world is None
+    assert report["drones"]["mav0"]["localized_share"] == 0.0
+    assert report["drones"]["mav1"]["ate_m"] is None
+    assert any("no estimate with a truth" in event["reason"] for event in report["events"])
+
+
+def test_the_alignment_is_the_leader_s_first_estimate_even_a_late_one(tmp_path: Path) -> None:
+    """Frame 0 refused: frame 1, which is 10 cm off, becomes the reference of all."""
+    flight = Flight(
+        refused=frozenset({("mav0", 0)}),
+        error=lambda name, k: np.array([0.1, 0, 0, 0, 0, 0]) * (name == "mav0" and k == 1),
+    )
+    _, report, _ = reported(tmp_path, flight)
+    assert report["drones"]["mav1"]["ate_m"] == pytest.approx(0.1, abs=1e-6)
+    assert report["drones"]["mav1"]["ate_aligned_m"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_what_does_not_add_up_is_said_aloud(tmp_path: Path) -> None:
+    unlogged = frozenset({("mav1", 4), ("mav1", 5)})
+    result, report, out = reported(tmp_path, Flight(unlogged=unlogged))
+    assert report["drones"]["mav1"]["unaccounted"] == 2
+    said = [event["reason"] for event in report["events"] if event["kind"] == "harness"]
+    assert "2 of 12 frames are not accounted for" in said
+    assert "10 frames localized by the log, 12 poses received" in said
+    assert "Look at this first" in page_of(result, out)
+
+
+def test_a_pose_at_the_time_of_no_frame_is_kept_and_said(tmp_path: Path) -> None:
+    plan, out = leave_behind(tmp_path, Flight())
+    path = out / "mav1" / "received.jsonl"
+    lines = path.read_text().splitlines()
+    late = json.loads(lines[-1])
+    late["fields"]["usec"] += 50_000
+    path.write_text("\n".join([*lines, json.dumps(late)]) + "\n")
+    result = gather(plan, out)
+    assert result.drones[1].frame_of.tolist() == [*range(12), -1]
+    assert result.drones[1].estimates.at_ns[-1] == (at_ns(1, 11) // 1000 + 50_000) * 1000
+    assert [e.reason for e in result.events if e.kind == "harness"] == [
+        "1 poses carry the time of no frame"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        ('{"kind":"frame","sequence":"one"}', r"flight\.jsonl, row 1: .*int"),
+        ('{"kind":"frame"', r"flight\.jsonl, row 1: not JSON"),
+        ("[1]", r"flight\.jsonl, row 1: not a JSON object"),
+    ],
+)
+def test_a_broken_log_names_file_and_row(tmp_path: Path, damage: str, message: str) -> None:
+    plan, out = leave_behind(tmp_path, Flight())
+    path = out / "run" / "mav1" / "flight.jsonl"
+    path.write_text(damage + "\n" + path.read_text())
+    with pytest.raises(FlightError, match=message):
+        gather(plan, out)
+
+
+def test_an_autopilot_that_hears_nan_is_told_so(tmp_path: Path) -> None:
+    plan, out = leave_behind(tmp_path, Flight())
+    path = out / "mav0" / "received.jsonl"
+    lines = path.read_text().splitlines()
+    row = json.loads(lines[2])
+    row["fields"]["x"] = float("nan")
+    path.write_text("\n".join([*lines[:2], json.dumps(row), *lines[3:]]) + "\n")
+    with pytest.raises(FlightError, match=r"received\.jsonl, row 3: .*finite"):
+        gather(plan, out)
+
+
+def test_a_missing_map_file_is_named(tmp_path: Path) -> None:
+    plan, out = leave_behind(tmp_path, Flight())
+    for path in (out / "run" / "mav0" / "maps").iterdir():
+        path.unlink()
+    with pytest.raises(FlightError, match=r"\.vclmap: No such file"):
+        gather(plan, out)
+
+
+class _Fetched(HTMLParser):
+    """Collects what a browser would go and fetch, and whether tags are balanced."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.open: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.addresses += [
+            value or ""
+            for key, value in attrs
+            if key in ("src", "href", "xlink:href", "srcset", "data", "action")
+        ]
+        assert tag not in ("script", "link", "iframe", "object")
+        if tag in ("section", "table", "svg", "main", "body", "html", "div"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if self.open and tag == self.open[-1]:
+            self.open.pop()
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_the_page_fetches_nothing_and_shows_every_plot(tmp_path: Path) -> None:
+    flight = Flight(refused=frozenset({("mav1", 5)}), dropped=frozenset({("mav1", 6)}))
+    result, _, out = reported(tmp_path, flight)
+    text = page_of(result, out)
+    page = _Fetched()
+    page.feed(text)
+    assert page.open == []
+    assert all(a.startswith(("#", "data:image/png;base64,")) for a in page.addresses)
+    assert not re.search(r"url\((?!#)|@import", text)
+    assert text.count("<svg role=") == 4
+    assert "paper <&>" in page.text
+    assert "9 of 30 <landmarks>" in page.text
+    assert "nan" not in re.sub(r"<[^>]*>", " ", text).lower().split()
+
+
+def test_the_page_of_a_flight_that_never_had_a_map(tmp_path: Path) -> None:
+    everything = frozenset((f"mav{n}", k) for n in range(2) for k in range(12))
+    plan, out = leave_behind(tmp_path, Flight(refused=everything))
+    for name in ("mav0", "mav1"):
+        path = out / "run" / name / "flight.jsonl"
+        kept = [row for row in path.read_text().splitlines() if '"kind": "map"' not in row]
+        path.write_text("\n".join(kept) + "\n")
+    result = gather(plan, out)
+    page = page_of(result, out)
+    assert ">0.0 %</b><span>of frames localized" in page
+    assert report_of(result)["map"] == {
+        "revisions": 0,
+        "landmarks": 0,
+        "bytes": 0,
+        "keyframes": 0,
+    }
+    assert len(result.points_ref_m) == 0
+
+
+def test_map_points_are_carried_into_the_recording_s_frame(tmp_path: Path) -> None:
+    result, _, _ = reported(tmp_path, Flight())
+    in_world = NED_FROM_WORLD.inverse().apply(result.points_ref_m)
+    # The map's own grid is 2^-16 m.
+    assert np.all(in_world > np.array([5, -8, -9]) - 1e-4)
+    assert np.all(in_world < np.array([12, 8, 1]) + 1e-4)
+
+
+def test_the_recording_on_paper_is_one_that_can_be_read(tmp_path: Path) -> None:
+    plan, _ = leave_behind(tmp_path, Flight(axes="NWU"))
+    truth = read_recording(plan.recording.path).drone("mav1").truth
+    assert truth is not None
+    assert plan.starts_at_ns == START_NS
+    assert truth.positions_m[7] == pytest.approx(ned_from_body(1, 7).translation, abs=1e-9)
