@@ -315,8 +315,10 @@ def _culled(
     error = np.linalg.norm(reprojection_residuals(views), axis=2)
     ideal = scene.ideal.copy()
     fits = error < limit_px
+    placed = np.isfinite(scene.points[:, 0])
     for column, i in enumerate(used):
-        ideal[~fits[:, column], i] = np.nan
+        # What no two registered views see is not placed yet, and not wrong either.
+        ideal[placed & ~fits[:, column], i] = np.nan
     cams = [scene.poses[i] @ drones[i].body_from_cam for i in used]
     angle = ray_angles(cams, np.nan_to_num(scene.points), fits)
     good = (fits.sum(axis=1) >= 2) & (angle > np.deg2rad(options.min_angle_deg))
