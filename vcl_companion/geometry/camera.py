@@ -8,6 +8,7 @@ coefficient order are OpenCV's and Kalibr's: ``radial-tangential`` (k1 k2 p1 p2
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -65,35 +66,68 @@ class Camera:
         return 0.5 * (self.fx_px + self.fy_px)
 
     def project(self, points_cam: Array) -> Array:
-        """Return (N, 2) pixels of (N, 3) points in the camera frame, m; NaN when behind it."""
+        """Return (N, 2) pixels of (N, 3) points in the camera frame, m.
+
+        NaN behind the camera, and so far aside that the distortion polynomial,
+        no longer a lens there, would fold the point back into the image.
+        """
         z = points_cam[:, 2]
         front = z > _MIN_DEPTH_M
         ideal = points_cam[:, :2] / np.where(front, z, np.nan)[:, None]
         return self.pixels_from_ideal(ideal)
 
     def pixels_from_ideal(self, ideal: Array) -> Array:
-        """Return (N, 2) pixels of (N, 2) ideal image coordinates x/z, y/z."""
+        """Return (N, 2) pixels of (N, 2) ideal image coordinates x/z, y/z; NaN past the fold."""
+        beyond = (ideal**2).sum(axis=1) >= self._fold_r2
+        if beyond.any():
+            ideal = np.where(beyond[:, None], np.nan, ideal)
         return self._distorted(ideal) * (self.fx_px, self.fy_px) + (self.cx_px, self.cy_px)
 
     def ideal_from_pixels(self, pixels: Array) -> Array:
         """Return (N, 2) ideal image coordinates x/z, y/z of (N, 2) pixels (distortion removed).
 
-        Newton's method on the distortion; a row is NaN where it does not
-        converge (a pixel the model cannot have produced).
+        Newton's method on the distortion; a row is NaN where it finds nothing
+        (a pixel the model cannot have produced).
         """
         distorted = (np.asarray(pixels, dtype=np.float64) - (self.cx_px, self.cy_px)) / (
             self.fx_px,
             self.fy_px,
         )
-        if self.distortion_model == "equidistant":
-            return self._ideal_from_equidistant(distorted)
-        if not any(self.distortion):
+        if self.distortion_model == "none":
             return np.asarray(distorted)
+        with np.errstate(all="ignore"):  # rows without a solution run away and end as NaN
+            if self.distortion_model == "equidistant":
+                return self._ideal_from_equidistant(distorted)
+            return self._ideal_from_radial_tangential(distorted)
+
+    @cached_property
+    def _fold_r2(self) -> float:
+        """Squared ideal radius where the distorted radius stops growing; infinite if it never does.
+
+        Beyond it the polynomial bends back: points far outside the view would
+        be projected into the image.
+        """
+        if not any(self.distortion):
+            return np.inf
+        fisheye = self.distortion_model == "equidistant"
+        radial = self.distortion if fisheye else self.distortion[:2] + self.distortion[4:]
+        slope = np.array([1.0, *((2 * n + 3) * k for n, k in enumerate(radial))])
+        # The root finder is no match for numbers that are no lens; a peer may send some.
+        slope = np.clip(np.where(np.abs(slope) < 1e-12, 0.0, slope), -1e12, 1e12)
+        roots = np.roots(slope[::-1])
+        real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0.0)]
+        square = float(real.min(initial=np.inf))
+        if not fisheye:
+            return square
+        return float(np.tan(np.sqrt(square)) ** 2) if square < (np.pi / 2) ** 2 else np.inf
+
+    def _ideal_from_radial_tangential(self, distorted: Array) -> Array:
+        """Invert by Newton's method with a numeric Jacobian; NaN where it does not converge."""
         ideal = distorted.copy()
         step = 1e-6
         for _ in range(20):
             error = self._distorted(ideal) - distorted
-            if error.size == 0 or np.nanmax(np.abs(error)) < 1e-12:
+            if not np.any(np.abs(error) >= 1e-12):
                 break
             dx, dy = (
                 (self._distorted(ideal + shift) - self._distorted(ideal - shift)) / (2 * step)
@@ -107,8 +141,9 @@ class Camera:
                 ],
                 axis=1,
             )
-        bad = ~(np.abs(self._distorted(ideal) - distorted).max(axis=1) < 1e-8)
-        ideal[bad] = np.nan
+        good = np.abs(self._distorted(ideal) - distorted).max(axis=1) < 1e-8
+        good &= (ideal**2).sum(axis=1) < self._fold_r2
+        ideal[~good] = np.nan
         return ideal
 
     def _distorted(self, ideal: Array) -> Array:
@@ -148,5 +183,6 @@ class Camera:
         t2 = theta * theta
         value = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
         ok = (np.abs(value - theta_d) < 1e-9) & (theta >= 0.0) & (theta < np.pi / 2 - 1e-3)
+        ok &= np.tan(theta) ** 2 < self._fold_r2
         scale = np.where(theta_d > 1e-9, np.tan(theta) / np.maximum(theta_d, 1e-9), 1.0)
         return np.asarray(np.where(ok, scale, np.nan)[:, None] * distorted)

@@ -198,12 +198,13 @@ def linearized(
 
     Returns:
         (N, 2) residuals, px; (N, 2, 6) by the pose; (N, 2, 3) by the point.
-        A point at or behind the camera gets a large residual and no slope.
+        A point at or behind the camera, or NaN, gets a large residual and no slope.
     """
     cam_from_body = body_from_cam.rotation.T
     points_body = (points - world_from_body.translation) @ world_from_body.rotation
     points_cam = (points_body - body_from_cam.translation) @ body_from_cam.rotation
     front = points_cam[:, 2] > _MIN_DEPTH_M
+    points_body = np.where(front[:, None], points_body, 0.0)
     z = np.where(front, points_cam[:, 2], 1.0)
     uv = points_cam[:, :2] / z[:, None]
     residual = (uv - ideal) * focal_px

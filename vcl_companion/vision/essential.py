@@ -8,7 +8,7 @@ decides with what else it knows (attitude, a third view).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -62,7 +62,8 @@ def relative_poses(
 
     Args:
         ideal_a: (M, 2) ideal image coordinates x/z, y/z in camera a.
-        ideal_b: (M, 2) the same places in camera b.
+        ideal_b: (M, 2) the same places in camera b. A match that is not finite
+            on either side is nobody's inlier and costs nothing.
         focal_px: px per ideal unit.
         rotation_guess: (3, 3) b_from_a from the autopilots' attitudes, or None.
         options: search settings.
@@ -71,8 +72,10 @@ def relative_poses(
     Returns:
         Hypotheses, cheapest first; empty when there are too few matches.
     """
-    if len(ideal_a) < _MIN_MATCHES:
+    usable = np.isfinite(np.hstack([ideal_a, ideal_b])).all(axis=1)
+    if usable.sum() < _MIN_MATCHES:
         return []
+    ideal_a, ideal_b = ideal_a[usable], ideal_b[usable]
     starts = _essential_starts(ideal_a, ideal_b, focal_px, options, seed)
     starts += _homography_starts(ideal_a, ideal_b, focal_px, options)
     if rotation_guess is not None:
@@ -88,6 +91,10 @@ def relative_poses(
             found.append(hypothesis)
         elif hypothesis.cost < found[twin].cost:
             found[twin] = hypothesis
+    for k, hypothesis in enumerate(found):
+        inliers = np.zeros(usable.shape[0], dtype=np.bool_)
+        inliers[usable] = hypothesis.inliers
+        found[k] = replace(hypothesis, inliers=inliers)
     return sorted(found, key=lambda h: h.cost)
 
 

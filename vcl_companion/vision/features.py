@@ -14,6 +14,9 @@ from vcl_companion.geometry.rotation import Array
 Detector = Literal["akaze", "sift", "orb"]
 Image = NDArray[np.uint8]
 
+# OpenCV's AKAZE corrupts memory on an image one pixel high, and images come from peers.
+_MIN_SIDE_PX = 32
+
 
 @dataclass(frozen=True)
 class FeatureOptions:
@@ -65,10 +68,13 @@ def detect(image: Image, detector: Detector, options: FeatureOptions) -> Feature
         options: how many and how strong.
 
     Returns:
-        At most ``max_features`` of them, one per position and kept strongest
-        first within each tile of an 8 x 6 grid, so that a rich corner of the
-        image cannot take all places.
+        At most ``max_features`` of them, kept strongest first within each tile
+        of an 8 x 6 grid, so that a rich corner of the image cannot take all
+        places; none in an image too small to hold any. SIFT may put several, one
+        per dominant direction, at one position.
     """
+    if min(image.shape[:2]) < _MIN_SIDE_PX:
+        return _none(detector)
     keypoints, found = _engine(detector, options).detectAndCompute(image, None)
     if found is None or len(keypoints) == 0:
         return _none(detector)
@@ -79,7 +85,6 @@ def detect(image: Image, detector: Detector, options: FeatureOptions) -> Feature
         descriptors = _root_sift(np.asarray(found, dtype=np.float32))
     else:
         descriptors = np.asarray(found, dtype=np.uint8)
-    # SIFT puts several features, one per dominant direction, at one position.
     keep = _spread(pixels, response, image.shape[1], image.shape[0], options.max_features)
     return Features(pixels[keep], descriptors[keep])
 
@@ -99,7 +104,8 @@ def _engine(detector: Detector, options: FeatureOptions) -> cv2.Feature2D:
     if detector == "sift":
         # Without precise upscaling OpenCV's SIFT sits 0.25 px right of and below the truth.
         return cv2.SIFT.create(contrastThreshold=options.sift_contrast, enable_precise_upscale=True)
-    return cv2.ORB.create(nfeatures=options.max_features, fastThreshold=10)
+    # ORB keeps the strongest by itself, wherever they are: more, for us to spread.
+    return cv2.ORB.create(nfeatures=4 * options.max_features, fastThreshold=10)
 
 
 def _root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -64,13 +64,17 @@ def match_to_entries(
         (K,) features and (K,) landmarks, one to one: of several features that
         chose one landmark the closest stays.
     """
-    if len(features) < 1 or len(entries) < 4:
+    if len(features) == 0 or len(entries) == 0:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    best, distance = _knn(cv2.BFMatcher(_norm(features)), features, entries, 4)
+    # As many neighbours as it takes to be sure of another landmark among them.
+    n_own = int(np.unique(owner, return_counts=True)[1].max())
+    best, distance = _knn(cv2.BFMatcher(_norm(features)), features, entries, n_own + 1)
     owners = owner[best]
     other = owners != owners[:, :1]
     second = np.where(
-        other.any(axis=1), distance[np.arange(len(best)), other.argmax(axis=1)], distance[:, -1]
+        other.any(axis=1),
+        distance[np.arange(len(best)), other.argmax(axis=1)],
+        _worst(features),
     )
     return _one_to_one(
         np.flatnonzero(distance[:, 0] < options.ratio * second), owners[:, 0], distance[:, 0]

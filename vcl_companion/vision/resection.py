@@ -22,6 +22,9 @@ Mask = NDArray[np.bool_]
 # 99 % of a two-dimensional Gaussian lies within this squared Mahalanobis distance.
 _CHI2_2_99 = 9.21
 _MAX_LEVERAGE = 0.4
+# Variance of the robust estimate over that of its weights taken as fixed, for Gaussian
+# noise in two dimensions: E[w^2 s/2] E[w]^2 / (E[w + s w']^2 E[w^2]) with w = (1 + s/4)^-2.
+_ROBUST_LOSS = 1.1136
 _MAX_ROUNDS = 3
 
 
@@ -69,6 +72,15 @@ class Sightings:
     noise_px: float
     bias_px: Array
 
+    def __post_init__(self) -> None:
+        if not self.noise_px > 0:
+            raise ValueError(f"noise_px must be positive, got {self.noise_px}")
+
+    def usable(self) -> Mask:
+        """Return (M,) which sightings are finite: a pixel may be none the lens can produce."""
+        finite = np.isfinite(self.ideal).all(axis=1) & np.isfinite(self.points).all(axis=1)
+        return np.asarray(finite & np.isfinite(self.point_covariances).all(axis=(1, 2)))
+
 
 @dataclass(frozen=True, eq=False)
 class Resection:
@@ -104,13 +116,14 @@ class NotFound:
 
 def search(sightings: Sightings, options: ResectionOptions) -> Pose | NotFound:
     """Find a pose that many sightings agree on, without any first guess (P3P, RANSAC)."""
-    n = len(sightings.points)
+    usable = sightings.usable()
+    n = int(usable.sum())
     if n < options.min_inliers:
         return NotFound(f"{n} landmarks matched, {options.min_inliers} needed")
     focal = sightings.focal_px
     ok, rvec, tvec, inliers = cv2.solvePnPRansac(
-        sightings.points,
-        sightings.ideal * focal,
+        sightings.points[usable],
+        sightings.ideal[usable] * focal,
         np.diag([focal, focal, 1.0]),
         None,
         iterationsCount=options.max_iterations,
@@ -140,10 +153,11 @@ def refine(
     Returns:
         The pose with its support, or why it is not to be believed.
     """
-    usable = np.ones(len(sightings.points), dtype=bool)
-    for _ in range(_MAX_ROUNDS):
+    usable = sightings.usable()
+    for n_rounds in range(_MAX_ROUNDS):
         if usable.sum() < options.min_inliers:
-            return NotFound(f"{usable.sum()} landmarks matched, {options.min_inliers} needed")
+            word = "left" if n_rounds else "matched"
+            return NotFound(f"{usable.sum()} landmarks {word}, {options.min_inliers} needed")
         pose = _converged(world_from_body, _of(sightings, usable))
         if isinstance(pose, NotFound):
             return pose
@@ -206,15 +220,15 @@ def _supported(
         gain,
         j_pose[inliers],
         j_point[inliers],
-        by_landmark.sum(axis=0) * sightings.noise_px**2,
-        np.einsum("nij,n->ij", by_landmark, sightings.bias_px[inliers] ** 2),
+        _ROBUST_LOSS * by_landmark.sum(axis=0) * sightings.noise_px**2,
+        _ROBUST_LOSS * np.einsum("nij,n->ij", by_landmark, sightings.bias_px[inliers] ** 2),
         float(np.sqrt((residual[inliers] ** 2).sum(axis=1).mean())),
     )
 
 
 def _leverage(found: Resection) -> Array:
     """Return (M_in,) how much of its most determined direction each inlier decides, 0 to 1."""
-    own = found.gain @ found.jacobian_pose
+    own = found.jacobian_pose @ found.gain
     return np.asarray(np.abs(np.linalg.eigvals(own)).max(axis=1))
 
 

@@ -17,13 +17,17 @@ def triangulate(worlds_from_cams: list[Pose], ideal: Array) -> Array:
         ideal: (N, V, 2) ideal image coordinates x/z, y/z; NaN where unseen.
 
     Returns:
-        (N, 3) points, world frame, m; NaN when seen by fewer than two views or
-        when the rays are parallel.
+        (N, 3) points, world frame, m; NaN when seen by fewer than two views, when
+        the rays are parallel, or when they all start from one place.
     """
     n = len(ideal)
     normal = np.zeros((n, 4, 4))
+    # Around the cameras, or precision is lost with the square of the distance to the origin.
+    centre = np.mean([pose.translation for pose in worlds_from_cams], axis=0)
     for i, world_from_cam in enumerate(worlds_from_cams):
-        cam_from_world = world_from_cam.inverse()
+        cam_from_world = Pose(
+            world_from_cam.rotation, world_from_cam.translation - centre
+        ).inverse()
         rows = np.hstack([cam_from_world.rotation, cam_from_world.translation[:, None]])
         seen = np.isfinite(ideal[:, i, 0])
         uv = np.where(seen[:, None], ideal[:, i], 0.0)
@@ -33,11 +37,12 @@ def triangulate(worlds_from_cams: list[Pose], ideal: Array) -> Array:
         equations = equations * seen[:, None, None]
         normal += np.einsum("nki,nkj->nij", equations, equations)
     n_seen = np.isfinite(ideal[:, :, 0]).sum(axis=1)
-    _, vectors = np.linalg.eigh(normal)
+    values, vectors = np.linalg.eigh(normal)
     homogeneous = vectors[:, :, 0]
     w = homogeneous[:, 3]
-    ok = (n_seen >= 2) & (np.abs(w) > 1e-9)
-    points = homogeneous[:, :3] / np.where(ok, w, 1.0)[:, None]
+    # The second eigenvalue is about the squared baseline, m^2: without one any depth will do.
+    ok = (n_seen >= 2) & (np.abs(w) > 1e-9) & (values[:, 1] > 1e-12)
+    points = homogeneous[:, :3] / np.where(ok, w, 1.0)[:, None] + centre
     points[~ok] = np.nan
     return np.asarray(points)
 
