@@ -186,3 +186,25 @@ def test_coefficients_of_no_lens_do_no_harm(model: DistortionModel, size: float)
         with np.errstate(all="ignore"):
             camera.project(np.array([[0.3, 0.2, 1.0], [5.0, 5.0, 1.0]]))
             assert camera.ideal_from_pixels(pixel_grid(camera)).shape == (21 * 17, 2)
+
+
+@cameras
+def test_slopes_are_how_pixels_follow_the_ray(camera: Camera) -> None:
+    ideal = camera.ideal_from_pixels(pixel_grid(camera))
+    ideal = ideal[np.isfinite(ideal[:, 0])]
+    slopes = camera.pixel_slopes(ideal)
+    nudge = np.array([3e-4, -2e-4])
+    moved = camera.pixels_from_ideal(ideal + nudge) - camera.pixels_from_ideal(ideal)
+    predicted = slopes @ nudge
+    assert np.abs(predicted - moved).max() < 2e-3
+    assert np.abs(predicted).max() > 1e-2
+
+
+def test_a_fisheye_shows_little_of_much_at_its_edge() -> None:
+    camera = Camera(640, 480, 200.0, 200.0, 320.0, 240.0, "equidistant", (0.0,) * 4)
+    angle = np.deg2rad(60.0)
+    slope = camera.pixel_slopes(np.array([[np.tan(angle), 0.0]]))[0]
+    # pixel = f theta along the radius: d theta / d tan theta = cos^2 theta.
+    np.testing.assert_allclose(
+        slope, np.diag([200.0 * np.cos(angle) ** 2, 200.0 * angle / np.tan(angle)]), rtol=1e-4
+    )

@@ -83,6 +83,20 @@ class Camera:
             ideal = np.where(beyond[:, None], np.nan, ideal)
         return self._distorted(ideal) * (self.fx_px, self.fy_px) + (self.cx_px, self.cy_px)
 
+    def pixel_slopes(self, ideal: Array) -> Array:
+        """Return (N, 2, 2) d(pixel) / d(ideal) at (N, 2) ideal image coordinates, px.
+
+        What weighs a residual of ideal coordinates as the detector's noise does:
+        towards the edge of a wide lens a pixel is many times as large there.
+        """
+        step = 1e-6
+        columns = [
+            (self.pixels_from_ideal(ideal + shift) - self.pixels_from_ideal(ideal - shift))
+            / (2 * step)
+            for shift in (np.array([step, 0.0]), np.array([0.0, step]))
+        ]
+        return np.stack(columns, axis=2)
+
     def ideal_from_pixels(self, pixels: Array) -> Array:
         """Return (N, 2) ideal image coordinates x/z, y/z of (N, 2) pixels (distortion removed).
 
