@@ -255,8 +255,11 @@ class _Matcher:
             guided,
             result.rms_px,
         )
-        sigma = float(np.sqrt(np.diag(fix.covariance())[:3].max()))
-        if not sigma <= self.options.max_sigma_m:
+        covariance = fix.covariance()
+        if not np.all(np.isfinite(covariance)):
+            return NotLocalized("the matched landmarks do not fix a pose", n_matched, n_inliers)
+        sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+        if sigma > self.options.max_sigma_m:
             return NotLocalized(
                 f"too uncertain: {sigma:.1f} m, {self.options.max_sigma_m:.1f} m allowed",
                 n_matched,

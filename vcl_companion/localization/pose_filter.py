@@ -25,7 +25,8 @@ _P, _B, _V, _W = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 _N_OWN = 12
 # 99.99 % of chi^2 with 6 and with 3 degrees of freedom: beyond, it is not noise.
 _GATE_POSE, _GATE_ROTATION = 27.9, 21.1
-_FORGOTTEN_M = 1e3
+# What is known after a jump, 1 sigma: nothing.
+_FORGOTTEN_M, _FORGOTTEN_M_S, _FORGOTTEN_RAD = 1e3, 10.0, np.pi
 _MAX_COAST_S = 60.0
 
 
@@ -35,7 +36,7 @@ class FilterOptions:
 
     Attributes:
         acceleration_m_s2: unknown acceleration, 1 sigma.
-        speed_m_s: unknown speed at the start and after a jump, 1 sigma per axis.
+        speed_m_s: unknown speed at the start, 1 sigma per axis.
         attitude_sigma_deg: noise of one attitude sample, 1 sigma.
         attitude_drift_deg_s: change of the attitude's offset in a second, 1 sigma.
         attitude_turn_error: change of that offset as a share of the angle turned, 1 sigma.
@@ -141,7 +142,7 @@ def predict(
 
     Args:
         state: at its own instant.
-        at_ns: the instant wanted; one before the state's leaves it where it is.
+        at_ns: the instant wanted; one before the state's is taken for the state's own.
         ned_from_body: (3, 3) attitude then, or None.
         options: process noise.
 
@@ -195,7 +196,8 @@ def update(predicted: FilterState, fix: Localized) -> FilterState | NotLocalized
     A fix whose position the covariances cannot explain (a relocalization, a
     prediction gone wrong) replaces position and speed and counts as a jump. One
     whose rotation contradicts the autopilot's turn since the last fix is wrong:
-    repeated structure, a planar twin.
+    repeated structure, a planar twin. Where the autopilot sends no attitude, a
+    jump replaces the rotation as well.
     """
     predicted = _with_map(predicted, fix)
     innovation = predicted.world_from_body.local(fix.world_from_body)
@@ -211,7 +213,7 @@ def update(predicted: FilterState, fix: Localized) -> FilterState | NotLocalized
             fix.n_inliers,
         )
     if innovation @ np.linalg.solve(expected, innovation) > _GATE_POSE:
-        predicted = _place_forgotten(predicted)
+        predicted = _forgotten(predicted)
         expected = observation @ predicted.covariance @ observation.T + noise
     gain = np.linalg.solve(expected, observation @ predicted.covariance).T
     gain[_N_OWN:] = 0.0  # considered, not estimated
@@ -251,7 +253,11 @@ def _to_pose(rotation: Array, n: int) -> Array:
 def _observation(predicted: FilterState, fix: Localized) -> Array:
     """Return (6, n): a fix sees the true pose, moved by the keyframes' errors."""
     out = _to_pose(predicted.world_from_body.rotation, len(predicted.covariance))
-    out[:, _N_OWN:] = fix.map_lever
+    # The lever is in the fix's axes. Left there, the little that these are turned against the
+    # predicted ones, new in every frame, would look like news of the map's error.
+    turned = predicted.world_from_body.rotation.T @ fix.world_from_body.rotation
+    out[:3, _N_OWN:] = turned @ fix.map_lever[:3]
+    out[3:, _N_OWN:] = turned @ fix.map_lever[3:]
     return out
 
 
@@ -269,10 +275,13 @@ def _with_map(state: FilterState, fix: Localized) -> FilterState:
     return replace(state, covariance=covariance)
 
 
-def _place_forgotten(state: FilterState) -> FilterState:
-    """Return the state that knows nothing of where it is, but still how it is turned."""
+def _forgotten(state: FilterState) -> FilterState:
+    """Return the state that knows nothing of where it is; with an autopilot, how it is turned."""
     covariance = state.covariance.copy()
-    for part, sigma in ((_P, _FORGOTTEN_M), (_V, 10.0)):
+    forgotten = [(_P, _FORGOTTEN_M), (_V, _FORGOTTEN_M_S)]
+    if state.ned_from_body is None:
+        forgotten.append((_B, _FORGOTTEN_RAD))
+    for part, sigma in forgotten:
         covariance[part] = covariance[:, part] = 0.0
         covariance[part, part] = np.eye(3) * sigma**2
     return replace(

@@ -17,7 +17,8 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, log_so3
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
-from vcl_companion.mapping.tracks import PairMatches, join_tracks, pixels_of_tracks
+from vcl_companion.mapping.leverage import leverages
+from vcl_companion.mapping.tracks import PairMatches, ideal_of_pixels, join_tracks, pixels_of_tracks
 from vcl_companion.mapping.uncertainty import map_uncertainty
 from vcl_companion.vision.bundle import (
     BundleOptions,
@@ -31,6 +32,9 @@ from vcl_companion.vision.features import Detector
 from vcl_companion.vision.matching import MatchOptions, match_mutual
 from vcl_companion.vision.resection import NotFound, ResectionOptions, Sightings, refine, search
 from vcl_companion.vision.triangulation import ray_angles, triangulate
+
+# A landmark that decides more than this of the poses is left out.
+_MAX_LEVERAGE = 0.25
 
 
 @dataclass(frozen=True)
@@ -95,12 +99,13 @@ class _Scene:
     """Views registered so far, in an arbitrary frame and scale until the end.
 
     ``ideal`` is (N, V, 2), NaN where unseen or found wrong; ``points`` (N, 3),
-    NaN where not placed; ``poses`` world_from_body of the registered views.
+    NaN where not placed; ``cams`` world_from_cam of the registered views: lever
+    arms are known in metres, and have no place here before the scale is known.
     """
 
     ideal: Array
     points: Array
-    poses: dict[int, Pose]
+    cams: dict[int, Pose]
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,13 +182,21 @@ def choose_hypothesis(
     ranked = sorted(hypotheses, key=total)
     best = ranked[0]
     for other in ranked[1:]:
-        turn = float(np.linalg.norm(log_so3(best.b_from_a.rotation.T @ other.b_from_a.rotation)))
-        if total(other) - total(best) < 9.0 and turn > np.deg2rad(4.0):
+        turn_deg, shift_deg = _degrees_apart(best.b_from_a, other.b_from_a)
+        # Twins of a short baseline are turned little, and yet displaced to elsewhere.
+        if total(other) - total(best) < 9.0 and (turn_deg > 4.0 or shift_deg > 10.0):
             return NoMap(
-                f"two relative poses {np.rad2deg(turn):.0f} degrees apart explain the matches "
-                "alike (a flat scene): let the drones see more relief"
+                f"two relative poses {max(turn_deg, shift_deg):.0f} degrees apart explain the "
+                "matches alike (a flat scene): let the drones see more relief"
             )
     return best
+
+
+def _degrees_apart(one: Pose, other: Pose) -> tuple[float, float]:
+    """Return the angle between two rotations and the one between two unit translations."""
+    turn = float(np.linalg.norm(log_so3(one.rotation.T @ other.rotation)))
+    cosine = float(np.clip(one.translation @ other.translation, -1.0, 1.0))
+    return float(np.rad2deg(turn)), float(np.rad2deg(np.arccos(cosine)))
 
 
 def _visibility_graph(
@@ -250,17 +263,11 @@ def _build(
     """Triangulate the seed pair, register the others, adjust, make it metric."""
     tracks = join_tracks([len(d.pixels) for d in drones], {p: e.matches for p, e in graph.items()})
     observed = pixels_of_tracks(tracks, [d.pixels for d in drones])
-    ideal = np.stack(
-        [d.camera.ideal_from_pixels(observed[:, i]) for i, d in enumerate(drones)], axis=1
-    )
-    body_from_cam = [drones[i].body_from_cam for i in pair]
+    ideal = ideal_of_pixels(observed, [d.camera for d in drones])
     scene = _Scene(
         ideal,
         np.full((len(ideal), 3), np.nan),
-        {
-            pair[0]: body_from_cam[0].inverse(),
-            pair[1]: chosen.b_from_a.inverse() @ body_from_cam[1].inverse(),
-        },
+        {pair[0]: Pose.identity(), pair[1]: chosen.b_from_a.inverse()},
     )
     scene = _adjusted(drones, scene, options)
     while True:
@@ -273,32 +280,38 @@ def _build(
 
 def _adjusted(drones: list[DroneView], scene: _Scene, options: MapOptions) -> _Scene:
     """Triangulate all that registered views see, adjust, drop what does not fit; twice."""
-    used = sorted(scene.poses)
+    used = sorted(scene.cams)
     ideal = scene.ideal.copy()
     for limit_px in (3.0 * options.max_error_px, options.max_error_px):
-        cams = [scene.poses[i] @ drones[i].body_from_cam for i in used]
-        points = triangulate(cams, ideal[:, used])
+        points = triangulate([scene.cams[i] for i in used], ideal[:, used])
         scene = replace(scene, points=points, ideal=ideal)
         ideal, good = _culled(drones, scene, limit_px, options)
-        views = _views(drones, replace(scene, ideal=ideal), good)
-        # The scale is free until known distances fix it: hold one baseline.
-        a, b = views.bodies[0], views.bodies[1]
-        length = float(np.linalg.norm(a.translation - b.translation))
-        hold = (Distance(0, 1, length, 1e-3 * length),)
-        adjusted, _ = adjust(replace(views, distances=hold), BundleOptions())
+        views = _held(_views(drones, replace(scene, ideal=ideal), good))
+        decisive = leverages(views) > _MAX_LEVERAGE
+        if decisive.any():
+            good[np.flatnonzero(good)[decisive]] = False
+            views = _held(_views(drones, replace(scene, ideal=ideal), good))
+        adjusted, _ = adjust(views, BundleOptions())
         points = np.full_like(points, np.nan)
         points[good] = adjusted.points
         scene = _Scene(ideal, points, dict(zip(used, adjusted.bodies, strict=True)))
     ideal, good = _culled(drones, scene, options.max_error_px, options)
     points = np.where(good[:, None], scene.points, np.nan)
-    return _Scene(ideal, points, scene.poses)
+    return _Scene(ideal, points, scene.cams)
+
+
+def _held(views: Views) -> Views:
+    """Hold one baseline: the scale is free until known distances fix it."""
+    a, b = views.bodies[0], views.bodies[1]
+    length = float(np.linalg.norm(a.translation - b.translation))
+    return replace(views, distances=(Distance(0, 1, length, 1e-3 * length),))
 
 
 def _views(drones: list[DroneView], scene: _Scene, good: NDArray[np.bool_]) -> Views:
-    used = sorted(scene.poses)
+    used = sorted(scene.cams)
     return Views(
-        bodies=tuple(scene.poses[i] for i in used),
-        mountings=tuple(drones[i].body_from_cam for i in used),
+        bodies=tuple(scene.cams[i] for i in used),
+        mountings=(Pose.identity(),) * len(used),
         focal_px=np.array([drones[i].camera.focal_px for i in used]),
         ideal=scene.ideal[good][:, used],
         points=scene.points[good],
@@ -310,7 +323,7 @@ def _culled(
     drones: list[DroneView], scene: _Scene, limit_px: float, options: MapOptions
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Drop observations that miss; return (N, V, 2) the rest and (N,) landmarks still good."""
-    used = sorted(scene.poses)
+    used = sorted(scene.cams)
     views = _views(drones, scene, np.ones(len(scene.points), dtype=bool))
     error = np.linalg.norm(reprojection_residuals(views), axis=2)
     ideal = scene.ideal.copy()
@@ -319,7 +332,7 @@ def _culled(
     for column, i in enumerate(used):
         # What no two registered views see is not placed yet, and not wrong either.
         ideal[placed & ~fits[:, column], i] = np.nan
-    cams = [scene.poses[i] @ drones[i].body_from_cam for i in used]
+    cams = [scene.cams[i] for i in used]
     angle = ray_angles(cams, np.nan_to_num(scene.points), fits)
     good = (fits.sum(axis=1) >= 2) & (angle > np.deg2rad(options.min_angle_deg))
     return ideal, np.asarray(good)
@@ -328,7 +341,7 @@ def _culled(
 def _register_next(drones: list[DroneView], scene: _Scene, options: MapOptions) -> _Scene | None:
     """Register the waiting view that sees most of what is placed; None when none can be."""
     placed = np.isfinite(scene.points[:, 0])
-    waiting = [i for i in range(len(drones)) if i not in scene.poses]
+    waiting = [i for i in range(len(drones)) if i not in scene.cams]
     common = {i: np.flatnonzero(placed & np.isfinite(scene.ideal[:, i, 0])) for i in waiting}
     for i in sorted(waiting, key=lambda i: len(common[i]), reverse=True):
         index = common[i]
@@ -337,7 +350,7 @@ def _register_next(drones: list[DroneView], scene: _Scene, options: MapOptions) 
             scene.points[index],
             np.zeros((len(index), 3, 3)),
             drones[i].camera.focal_px,
-            drones[i].body_from_cam,
+            Pose.identity(),
             1.0,
             np.zeros(len(index)),
         )
@@ -349,7 +362,7 @@ def _register_next(drones: list[DroneView], scene: _Scene, options: MapOptions) 
         if not isinstance(found, NotFound):
             ideal = scene.ideal.copy()
             ideal[index[~found.inliers], i] = np.nan
-            return replace(scene, ideal=ideal, poses={**scene.poses, i: found.world_from_body})
+            return replace(scene, ideal=ideal, cams={**scene.cams, i: found.world_from_body})
     return None
 
 
@@ -361,9 +374,9 @@ def _metric(
     options: MapOptions,
 ) -> LandmarkMap | NoMap:
     """Scale by the known distances, place in the leader's world, adjust once more."""
-    if 0 not in scene.poses:
+    if 0 not in scene.cams:
         return NoMap(f"the leader, drone {drones[0].drone_id}, sees too little of what others see")
-    used = sorted(scene.poses)
+    used = sorted(scene.cams)
     ids = [drones[i].drone_id for i in used]
     known = [
         Distance(ids.index(a), ids.index(b), length, options.distance_sigma_m)
@@ -375,28 +388,32 @@ def _metric(
             f"no known distance between drones that see the same (drones {ids} do): "
             "the scale is unknown"
         )
-    poses = [scene.poses[i] for i in used]
+    if drones[0].ned_from_body is None:
+        raise ValueError("the leader's attitude is checked before")
+    cams = [scene.cams[i] for i in used]
+    # Of the cameras instead of the bodies: the adjustment settles the lever arms' share.
     ratios = [
-        d.distance_m / float(np.linalg.norm(poses[d.a].translation - poses[d.b].translation))
+        d.distance_m / float(np.linalg.norm(cams[d.a].translation - cams[d.b].translation))
         for d in known
     ]
     scale = float(np.median(ratios))
-    if drones[0].ned_from_body is None:
-        raise ValueError("the leader's attitude is checked before")
-    world_from_scene = Pose(drones[0].ned_from_body, np.zeros(3)) @ poses[0].inverse()
+    leader_cam = Pose(drones[0].ned_from_body, np.zeros(3)) @ drones[0].body_from_cam
+    world_from_scene = leader_cam @ cams[0].inverse()
     placed = np.isfinite(scene.points[:, 0])
-    metric = replace(
-        scene,
-        points=_scaled(world_from_scene, scale, scene.points, poses[0]),
-        poses={
-            i: Pose(
-                world_from_scene.rotation @ pose.rotation,
-                _scaled(world_from_scene, scale, pose.translation, poses[0]),
+    views = replace(
+        _views(drones, scene, placed),
+        bodies=tuple(
+            Pose(
+                world_from_scene.rotation @ cam.rotation,
+                _scaled(world_from_scene, scale, cam.translation, cams[0]),
             )
-            for i, pose in zip(used, poses, strict=True)
-        },
+            @ drones[i].body_from_cam.inverse()
+            for i, cam in zip(used, cams, strict=True)
+        ),
+        mountings=tuple(drones[i].body_from_cam for i in used),
+        points=_scaled(world_from_scene, scale, scene.points[placed], cams[0]),
+        distances=tuple(known),
     )
-    views = replace(_views(drones, metric, placed), distances=tuple(known))
     views, noise_px = adjust(views, BundleOptions())
     seen = np.isfinite(views.ideal[:, :, :1])
     landmark_map = LandmarkMap(
@@ -414,9 +431,10 @@ def _metric(
     return _accepted(landmark_map, options)
 
 
-def _scaled(world_from_scene: Pose, scale: float, points: Array, leader: Pose) -> Array:
-    """Scale about the leader's body, then carry over to the world."""
-    return world_from_scene.apply(leader.translation + scale * (points - leader.translation))
+def _scaled(world_from_scene: Pose, scale: float, points: Array, leader_cam: Pose) -> Array:
+    """Scale about the leader's camera, then carry over to the world."""
+    centre = leader_cam.translation
+    return world_from_scene.apply(centre + scale * (points - centre))
 
 
 def _accepted(landmark_map: LandmarkMap, options: MapOptions) -> LandmarkMap | NoMap:

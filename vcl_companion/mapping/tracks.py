@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.rotation import Array
 
 
@@ -60,4 +61,16 @@ def pixels_of_tracks(tracks: NDArray[np.intp], pixels: list[Array]) -> Array:
     for i, positions in enumerate(pixels):
         seen = tracks[:, i] >= 0
         out[seen, i] = positions[tracks[seen, i]]
+    return out
+
+
+def ideal_of_pixels(observed_px: Array, cameras: list[Camera]) -> Array:
+    """Return (N, V, 2) ideal image coordinates x/z, y/z of (N, V, 2) raw pixels of V cameras.
+
+    NaN where unseen, and where a camera's model cannot have produced the pixel.
+    """
+    out = np.full(observed_px.shape, np.nan)
+    for i, camera in enumerate(cameras):
+        seen = np.isfinite(observed_px[:, i, 0])
+        out[seen, i] = camera.ideal_from_pixels(observed_px[seen, i])
     return out

@@ -9,13 +9,19 @@ average out over landmarks or frames and is what fusing must not forget.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.tracks import ideal_of_pixels
 from vcl_companion.vision.bundle import Distance, Views, normal_equations
+
+# Smallest eigenvalue of an information matrix with ones on its diagonal; rounding leaves 1e-16.
+_SINGULAR = 1e-12
+# No distance between drones is known better; much smaller sigmas overflow.
+_FINEST_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +47,11 @@ class MapUncertainty:
 def views_of(landmark_map: LandmarkMap) -> Views:
     """Return the map as the bundle adjustment sees it."""
     keyframes = landmark_map.keyframes
-    ideal = np.full(landmark_map.observed_px.shape, np.nan)
-    for i, keyframe in enumerate(keyframes):
-        ideal[:, i] = keyframe.camera.ideal_from_pixels(landmark_map.observed_px[:, i])
     return Views(
         bodies=tuple(k.world_from_body for k in keyframes),
         mountings=tuple(k.body_from_cam for k in keyframes),
         focal_px=np.array([k.camera.focal_px for k in keyframes]),
-        ideal=ideal,
+        ideal=ideal_of_pixels(landmark_map.observed_px, [k.camera for k in keyframes]),
         points=landmark_map.points_world,
         distances=tuple(
             Distance(d.keyframe_a, d.keyframe_b, d.distance_m, d.sigma_m)
@@ -62,31 +65,34 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
 
     Raises:
         ValueError: the map's observations do not fix it (no known distance, a
-            keyframe that shares nothing).
+            keyframe that shares nothing, a landmark seen once), or a distance
+            is claimed to be exact.
     """
-    noise = landmark_map.pixel_noise_px
-    views = views_of(landmark_map)
-    # Distances enter in units of their own sigma; pixels in px: bring both to sigmas.
-    scaled = Views(
-        views.bodies,
-        views.mountings,
-        views.focal_px / noise,
-        views.ideal,
-        views.points,
-        views.distances,
-    )
-    system = normal_equations(scaled, None)
-    try:
-        inverse = np.linalg.inv(system.point_block)
+    if not all(distance.sigma_m >= _FINEST_M for distance in landmark_map.distances):
+        raise ValueError("the map claims to know a distance exactly")
+    # A map may come from a peer: whatever its numbers are, they only fail the tests below.
+    with np.errstate(all="ignore"):
+        views = views_of(landmark_map)
+        # Distances enter in units of their own sigma; pixels in px: bring both to sigmas.
+        scaled = replace(views, focal_px=views.focal_px / landmark_map.pixel_noise_px)
+        system = normal_equations(scaled, None)
+        inverse = _inverse(system.point_block)
         lever = -np.swapaxes(system.cross @ inverse, 1, 2)
         reduced = system.pose_block + np.einsum("nji,nkj->ik", lever, system.cross)
         covariance = np.zeros_like(reduced)
-        covariance[6:, 6:] = np.linalg.inv(reduced[6:, 6:])
-    except np.linalg.LinAlgError as error:
-        raise ValueError("the map's observations do not fix it") from error
-    diagonal = np.diag(covariance)
-    if not np.all(np.isfinite(covariance)) or np.any(diagonal < 0):
+        covariance[6:, 6:] = _inverse(reduced[6:, 6:])
+    return MapUncertainty(covariance, inverse, lever)
+
+
+def _inverse(information: Array) -> Array:
+    """Return the inverses of (..., K, K) information matrices.
+
+    Raises:
+        ValueError: one of them is not positive definite, or hardly is.
+    """
+    size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
+    unit = information / (size[..., :, None] * size[..., None, :])
+    if not np.all(np.isfinite(unit)) or np.any(np.linalg.eigvalsh(unit) < _SINGULAR):
         raise ValueError("the map's observations do not fix it")
-    return MapUncertainty(
-        0.5 * (covariance + covariance.T), np.asarray(inverse, dtype=np.float64), lever
-    )
+    out = np.linalg.inv(unit) / (size[..., :, None] * size[..., None, :])
+    return np.asarray(0.5 * (out + np.swapaxes(out, -1, -2)))

@@ -1,0 +1,191 @@
+"""The factored covariance is the inverse of the whole normal matrix, and it is honest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.checks import assert_consistent, nees
+from tests.mapping.views import map_of
+from tests.scenes import CAMERAS, Scene, facade_scene
+from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.mapping.landmark_map import KnownDistance, LandmarkMap
+from vcl_companion.mapping.uncertainty import map_uncertainty, views_of
+from vcl_companion.vision.bundle import BundleOptions, Distance, adjust, normal_equations
+
+
+def dense_covariance(landmark_map: LandmarkMap) -> Array:
+    """Invert the whole normal matrix: keyframes 1 to V-1, then every landmark."""
+    noise = landmark_map.pixel_noise_px
+    views = views_of(landmark_map)
+    system = normal_equations(replace(views, focal_px=views.focal_px / noise), None)
+    n_poses, n_points = len(system.pose_block), len(system.point_block)
+    size = n_poses + 3 * n_points
+    whole = np.zeros((size, size))
+    whole[:n_poses, :n_poses] = system.pose_block
+    for j in range(n_points):
+        own = slice(n_poses + 3 * j, n_poses + 3 * j + 3)
+        whole[own, own] = system.point_block[j]
+        whole[:n_poses, own] = system.cross[j]
+        whole[own, :n_poses] = system.cross[j].T
+    return np.asarray(np.linalg.inv(whole[6:, 6:]))
+
+
+@pytest.mark.parametrize("n_views", [2, 3])
+def test_the_factored_covariance_is_the_dense_inverse(n_views: int) -> None:
+    scene = facade_scene(np.random.default_rng(0), 25, n_views=n_views, missed=0.1)
+    landmark_map = map_of(scene)
+    uncertainty = map_uncertainty(landmark_map)
+    dense = dense_covariance(landmark_map)
+    n = 6 * (n_views - 1)
+    scale = np.sqrt(np.diag(dense))
+
+    def assert_equal(factored: Array, rows: slice, columns: slice) -> None:
+        unit = np.outer(scale[rows], scale[columns])
+        np.testing.assert_allclose(factored / unit, dense[rows, columns] / unit, atol=1e-6)
+
+    poses = slice(0, n)
+    keyframes = uncertainty.keyframe_covariance
+    np.testing.assert_array_equal(keyframes[:6], 0.0)
+    assert_equal(keyframes[6:, 6:], poses, poses)
+    for j, marginal in enumerate(uncertainty.marginal()):
+        own = slice(n + 3 * j, n + 3 * j + 3)
+        other = slice(n, n + 3)
+        assert_equal(marginal, own, own)
+        shared = uncertainty.landmark_lever[j] @ keyframes
+        assert_equal(shared[:, 6:], own, poses)
+        if j > 0:
+            assert_equal(shared @ uncertainty.landmark_lever[0].T, own, other)
+
+
+def noisy_map(rng: np.random.Generator, scene: Scene, sigma_m: float) -> LandmarkMap:
+    """Measure a scene again, its known distance too, and adjust from the truth."""
+    truth = map_of(scene, sigma_m)
+    again = truth.observed_px + scene.noise_px * rng.standard_normal(truth.observed_px.shape)
+    measured = scene.baseline_m(0, 1) + sigma_m * float(rng.standard_normal())
+    noisy = replace(
+        truth,
+        observed_px=again,
+        pixel_noise_px=scene.noise_px,
+        distances=(KnownDistance(0, 1, measured, sigma_m),),
+    )
+    views = views_of(noisy)
+    # Plain least squares: this test is about the covariance, not about outliers. The known
+    # distance weighs in units of its sigma, the pixels in units of theirs.
+    weighted = replace(
+        views,
+        focal_px=views.focal_px / scene.noise_px,
+        distances=(Distance(0, 1, measured, sigma_m),),
+    )
+    adjusted, _ = adjust(weighted, BundleOptions(cauchy_px=100.0))
+    keyframes = tuple(
+        replace(k, world_from_body=body)
+        for k, body in zip(noisy.keyframes, adjusted.bodies, strict=True)
+    )
+    return replace(noisy, keyframes=keyframes, points_world=adjusted.points)
+
+
+def test_keyframes_and_landmarks_err_as_much_as_stated() -> None:
+    rng = np.random.default_rng(7)
+    scene = replace(facade_scene(rng, 60, relief_m=4.0, n_views=3), noise_px=0.4)
+    truth = map_of(scene)
+    poses, pose_sigma, points, point_sigma = [], [], [], []
+    for _ in range(60):
+        found = noisy_map(rng, scene, 0.02)
+        uncertainty = map_uncertainty(found)
+        poses.append(
+            np.concatenate(
+                [
+                    t.world_from_body.local(k.world_from_body)
+                    for t, k in zip(truth.keyframes[1:], found.keyframes[1:], strict=True)
+                ]
+            )
+        )
+        pose_sigma.append(uncertainty.keyframe_covariance[6:, 6:])
+        j = int(rng.integers(len(found.points_world)))
+        points.append(found.points_world[j] - truth.points_world[j])
+        point_sigma.append(uncertainty.marginal()[j])
+    assert_consistent(poses, pose_sigma)
+    assert_consistent(points, point_sigma)
+    # The shared part matters: without it a landmark would seem far better known than it is.
+    alone = nees(points, map_uncertainty(truth).landmark_covariance.mean(axis=0))
+    assert float(alone.mean()) > 2.0 * float(nees(points, point_sigma).mean())
+
+
+def test_a_better_known_distance_is_a_better_scale() -> None:
+    scene = facade_scene(np.random.default_rng(0), 100, relief_m=4.0, noise_px=0.3)
+    direction = np.concatenate([scene.bodies[1].rotation.T @ scene.bodies[1].translation, [0] * 3])
+    direction /= np.linalg.norm(direction)
+    for sigma_m in (0.1, 0.01):
+        covariance = map_uncertainty(map_of(scene, sigma_m)).keyframe_covariance[6:, 6:]
+        along_m = float(np.sqrt(direction @ covariance @ direction))
+        assert along_m == pytest.approx(sigma_m, rel=0.01)
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.distortion_model)
+def test_every_camera_model_gives_a_covariance(camera: Camera) -> None:
+    scene = facade_scene(np.random.default_rng(0), 40, n_views=3, camera=camera)
+    marginal = map_uncertainty(map_of(scene)).marginal()
+    assert np.all(np.linalg.eigvalsh(marginal) > 0)
+
+
+def degenerate_maps() -> dict[str, LandmarkMap]:
+    scene = facade_scene(np.random.default_rng(0), 40, n_views=3)
+    good = map_of(scene)
+    seen_once = good.observed_px.copy()
+    seen_once[5, 1:] = np.nan
+    unseen = good.observed_px.copy()
+    unseen[5] = np.nan
+    alone = good.observed_px.copy()
+    alone[:, 2] = np.nan
+    shared = np.isfinite(alone[..., 0]).sum(axis=1) >= 2
+    behind = good.points_world * [-1.0, 1.0, 1.0]
+    inside = good.points_world.copy()
+    cam = good.keyframes[0].world_from_body @ good.keyframes[0].body_from_cam
+    inside[3] = cam.translation
+    same = tuple(replace(k, world_from_body=Pose.identity()) for k in good.keyframes)
+    one = np.broadcast_to(good.points_world[:1], good.points_world.shape)
+    empty = replace(good, points_world=np.zeros((0, 3)), observed_px=np.zeros((0, 3, 2)))
+    single = replace(
+        good, keyframes=good.keyframes[:1], observed_px=good.observed_px[:, :1], distances=()
+    )
+    tiny = (KnownDistance(0, 1, 2.0, 1e-300),)
+    wide = Camera(640, 480, 1e-200, 1e-200, 319.5, 239.5)
+    return {
+        "no distance": replace(good, distances=()),
+        "exact distance": replace(good, distances=(KnownDistance(0, 1, 2.0, 0.0),)),
+        "distance known to 1e-300 m": replace(good, distances=tiny),
+        "a landmark seen once": replace(good, observed_px=seen_once),
+        "a landmark unseen": replace(good, observed_px=unseen),
+        "a keyframe that shares nothing": replace(
+            good, points_world=good.points_world[shared], observed_px=alone[shared]
+        ),
+        "landmarks behind all keyframes": replace(good, points_world=behind),
+        "a landmark in a camera's centre": replace(good, points_world=inside),
+        "keyframes all in one place": replace(good, keyframes=same),
+        "landmarks all in one place": replace(good, points_world=one),
+        "landmarks at infinity": replace(good, points_world=good.points_world * 1e9),
+        "no landmarks": empty,
+        "one keyframe": single,
+        "no noise to speak of": replace(good, pixel_noise_px=1e-300),
+        "endless noise": replace(good, pixel_noise_px=1e300),
+        "an absurd lens": replace(
+            good, keyframes=tuple(replace(k, camera=wide) for k in good.keyframes)
+        ),
+    }
+
+
+@pytest.mark.parametrize("name", degenerate_maps())
+def test_a_map_that_its_observations_do_not_fix_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=r"do not fix it|claims to know a distance exactly"):
+        map_uncertainty(degenerate_maps()[name])
+
+
+def test_a_map_without_lever_arms_or_turns_is_fixed_too() -> None:
+    """Parallel cameras in the body's centre: symmetric, not degenerate."""
+    scene = facade_scene(np.random.default_rng(0), 40, turn_deg=0.0, lever_arm_m=0.0)
+    assert np.all(np.linalg.eigvalsh(map_uncertainty(map_of(scene)).marginal()) > 0)
