@@ -62,6 +62,13 @@ class Scene:
         return len(self.bodies)
 
     @property
+    def slopes(self) -> Array:
+        """(N, V, 2, 2) d(pixel) / d(ideal) at the observations; NaN where unseen."""
+        ideal = self.ideal
+        views = range(ideal.shape[1])
+        return np.stack([self.camera.pixel_slopes(ideal[:, i]) for i in views], axis=1)
+
+    @property
     def seen(self) -> NDArray[np.bool_]:
         """(N, V) which landmark was observed in which view."""
         return np.asarray(np.isfinite(self.observed_px[..., 0]))

@@ -22,7 +22,7 @@ def dense_covariance(landmark_map: LandmarkMap) -> Array:
     """Invert the whole normal matrix: keyframes 1 to V-1, then every landmark."""
     noise = landmark_map.pixel_noise_px
     views = views_of(landmark_map)
-    system = normal_equations(replace(views, focal_px=views.focal_px / noise), None)
+    system = normal_equations(replace(views, slopes=views.slopes / noise), None)
     n_poses, n_points = len(system.pose_block), len(system.point_block)
     size = n_poses + 3 * n_points
     whole = np.zeros((size, size))
@@ -78,7 +78,7 @@ def noisy_map(rng: np.random.Generator, scene: Scene, sigma_m: float) -> Landmar
     # distance weighs in units of its sigma, the pixels in units of theirs.
     weighted = replace(
         views,
-        focal_px=views.focal_px / scene.noise_px,
+        slopes=views.slopes / scene.noise_px,
         distances=(Distance(0, 1, measured, sigma_m),),
     )
     adjusted, _ = adjust(weighted, BundleOptions(cauchy_px=100.0))

@@ -28,7 +28,7 @@ def views_of(scene: Scene, bodies: tuple[Pose, ...], points: Array) -> Views:
     return Views(
         bodies,
         scene.mountings,
-        np.full(scene.n_views, scene.camera.focal_px),
+        scene.slopes[twice],
         scene.ideal[twice],
         points[twice],
         (Distance(0, 1, scene.baseline_m(0, 1), 0.01),),
@@ -41,7 +41,7 @@ def truth_of(scene: Scene) -> Views:
 
 def joint_covariance(views: Views, noise_px: float) -> Array:
     """(6V-6, 6V-6) of the free poses, by inverting the whole dense normal matrix."""
-    system = normal_equations(replace(views, focal_px=views.focal_px / noise_px), None)
+    system = normal_equations(replace(views, slopes=views.slopes / noise_px), None)
     n, n_pose = len(views.points), len(system.pose_rhs)
     dense = np.zeros((n_pose + 3 * n, n_pose + 3 * n))
     dense[:n_pose, :n_pose] = system.pose_block
@@ -58,11 +58,12 @@ def test_jacobians_are_the_numeric_ones() -> None:
     scene = facade_scene(rng, 6, 4.0, turn_deg=20.0, lever_arm_m=0.5, noise_px=3.0, camera=PINHOLE)
     body, mounting, points = scene.bodies[1], scene.mountings[1], scene.points_world
     ideal = rng.uniform(-0.5, 0.5, (6, 2))
+    slopes = rng.uniform(-300.0, 300.0, (6, 2, 2))
 
     def residual(pose: Pose, at: Array) -> Array:
-        return linearized(pose, mounting, 300.0, at, ideal)[0]
+        return linearized(pose, mounting, slopes, at, ideal)[0]
 
-    _, by_pose, by_point = linearized(body, mounting, 300.0, points, ideal)
+    _, by_pose, by_point = linearized(body, mounting, slopes, points, ideal)
     numeric = numeric_jacobian(lambda d: residual(body.retracted(d), points), np.zeros(6))
     np.testing.assert_allclose(by_pose.reshape(12, 6), numeric, rtol=1e-5, atol=1e-5)
     for j in range(6):
@@ -77,7 +78,11 @@ def test_jacobians_are_the_numeric_ones() -> None:
 def test_residual_is_that_of_the_camera_model() -> None:
     scene = facade_scene(np.random.default_rng(2), 50, noise_px=1.0)
     residual, _, _ = linearized(
-        scene.bodies[1], scene.mountings[1], 320.0, scene.points_world, scene.ideal[:, 1]
+        scene.bodies[1],
+        scene.mountings[1],
+        scene.slopes[:, 1],
+        scene.points_world,
+        scene.ideal[:, 1],
     )
     seen = scene.seen[:, 1]
     expected = (scene.exact_px - scene.observed_px)[seen, 1]
@@ -91,7 +96,11 @@ def test_what_is_behind_the_camera_costs_but_does_not_pull() -> None:
     points = np.array([[-5.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [5.0, 1.0, 0.5], [0.0, 0.0, 0.0]])
     scene = facade_scene(np.random.default_rng(3), 5, lever_arm_m=0.0)
     residual, by_pose, by_point = linearized(
-        scene.bodies[0], scene.mountings[0], 320.0, points, np.zeros((4, 2))
+        scene.bodies[0],
+        scene.mountings[0],
+        np.tile(320.0 * np.eye(2), (4, 1, 1)),
+        points,
+        np.zeros((4, 2)),
     )
     for j in (0, 1, 3):
         assert np.linalg.norm(residual[j]) > 1e3
@@ -219,9 +228,11 @@ def test_degenerate_problems_end_quietly() -> None:
     rng = np.random.default_rng(10)
     scene = facade_scene(rng, 20, n_views=2, noise_px=0.2)
     views = truth_of(scene)
-    nothing = replace(views, ideal=views.ideal[:0], points=views.points[:0])
+    nothing = replace(
+        views, ideal=views.ideal[:0], slopes=views.slopes[:0], points=views.points[:0]
+    )
     alone = replace(
-        views, bodies=views.bodies[:1], mountings=views.mountings[:1], focal_px=views.focal_px[:1],
+        views, bodies=views.bodies[:1], mountings=views.mountings[:1], slopes=views.slopes[:, :1],
         ideal=views.ideal[:, :1], distances=(),
     )  # fmt: skip
     unscaled = replace(views, distances=())

@@ -38,6 +38,7 @@ def sightings_of(scene: Scene, points: Array | None = None, sigma_m: float = 0.0
         (scene.points_world if points is None else points)[seen],
         np.tile(sigma_m**2 * np.eye(3), (n, 1, 1)),
         scene.camera.focal_px,
+        scene.slopes[seen, 1],
         scene.mountings[1],
         max(scene.noise_px, 0.3),
         np.zeros(n),
@@ -263,7 +264,7 @@ def test_degenerate_sightings_are_refused_and_raise_nothing() -> None:
         "unknown": replace(good, point_covariances=np.full((n, 3, 3), np.nan)),
         "nothing": Sightings(
             good.ideal[:0], good.points[:0], good.point_covariances[:0], 320.0,
-            good.body_from_cam, 0.5, good.bias_px[:0],
+            good.slopes[:0], good.body_from_cam, 0.5, good.bias_px[:0],
         ),
     }  # fmt: skip
     at_it = Pose(scene.bodies[1].rotation, np.array([9.9999, 0.0, 0.0]))
@@ -308,3 +309,15 @@ def test_no_noise_at_all_is_an_error(noise_px: float) -> None:
     scene = facade_scene(np.random.default_rng(11), 30)
     with pytest.raises(ValueError, match="noise_px must be positive"):
         replace(sightings_of(scene), noise_px=noise_px)
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.distortion_model)
+def test_a_distorted_lens_s_noise_is_weighed_in_pixels(camera: Camera) -> None:
+    errors, covariances = [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        scene = facade_scene(rng, 150, 2.0, noise_px=0.5, camera=camera)
+        result = found(refine(scene.bodies[1], sightings_of(scene), OPTIONS))
+        errors.append(scene.bodies[1].local(result.world_from_body))
+        covariances.append(result.noise_covariance)
+    assert_consistent(errors, np.array(covariances), slack=1.1)

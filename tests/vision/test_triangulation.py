@@ -55,7 +55,7 @@ def test_errors_are_those_of_least_squares(n_views: int) -> None:
     information = np.zeros((int(seen.sum()), 3, 3))
     for i in range(n_views):
         _, _, by_point = linearized(
-            scene.bodies[i], scene.mountings[i], scene.camera.focal_px, scene.points_world[seen],
+            scene.bodies[i], scene.mountings[i], scene.slopes[seen, i], scene.points_world[seen],
             scene.ideal[seen, i],
         )  # fmt: skip
         information += np.swapaxes(by_point, 1, 2) @ by_point / scene.noise_px**2

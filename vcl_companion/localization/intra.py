@@ -160,14 +160,14 @@ def localize_intra(
     scene = _Matcher(features, camera, body_from_cam, index, options)
     attempt = None
     guided = False
-    if prior is not None:
-        radius_px = scene.radius_px(prior)
-        if radius_px <= options.guided_radius_px:
-            attempt = scene.guided(prior.world_from_body, max(radius_px, _SURE_PX))
-            guided = isinstance(attempt.result, Resection)
+    radius_px = float("inf") if prior is None else scene.radius_px(prior)
+    if prior is not None and radius_px <= options.guided_radius_px:
+        attempt = scene.guided(prior.world_from_body, max(radius_px, _SURE_PX))
+        guided = isinstance(attempt.result, Resection)
     if attempt is None or not guided:
         attempt = scene.whole_map()
-    if isinstance(attempt.result, Resection):
+    # Matched from nearby already, a second round would find the same again.
+    if isinstance(attempt.result, Resection) and not (guided and radius_px <= 2.0 * _SURE_PX):
         again = scene.guided(attempt.result.world_from_body, _SURE_PX)
         if (
             isinstance(again.result, Resection)
@@ -302,11 +302,13 @@ class _Matcher:
         bias_px = np.zeros(len(landmarks))
         if world_from_body is not None:
             bias_px = self._bias_px(landmarks, world_from_body)
+        ideal = self.camera.ideal_from_pixels(self.features.pixels[found])
         return Sightings(
-            self.camera.ideal_from_pixels(self.features.pixels[found]),
+            ideal,
             self.index.landmark_map.points_world[landmarks],
             self.index.landmark_covariances[landmarks],
             self.camera.focal_px,
+            self.camera.pixel_slopes(ideal),
             self.body_from_cam,
             max(self.options.noise_floor_px, self.index.landmark_map.pixel_noise_px),
             bias_px,

@@ -32,7 +32,7 @@ def leverages(views: Views) -> Array:
         _, j_pose, _ = linearized(
             views.bodies[i],
             views.mountings[i],
-            views.focal_px[i],
+            views.slopes[seen, i],
             views.points[seen],
             views.ideal[seen, i],
         )

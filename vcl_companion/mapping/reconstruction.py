@@ -18,7 +18,13 @@ from vcl_companion.geometry.rotation import Array, log_so3
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
 from vcl_companion.mapping.leverage import leverages
-from vcl_companion.mapping.tracks import PairMatches, ideal_of_pixels, join_tracks, pixels_of_tracks
+from vcl_companion.mapping.tracks import (
+    PairMatches,
+    ideal_of_pixels,
+    join_tracks,
+    pixels_of_tracks,
+    slopes_of_ideal,
+)
 from vcl_companion.mapping.uncertainty import map_uncertainty
 from vcl_companion.vision.bundle import (
     BundleOptions,
@@ -98,12 +104,14 @@ class NoMap:
 class _Scene:
     """Views registered so far, in an arbitrary frame and scale until the end.
 
-    ``ideal`` is (N, V, 2), NaN where unseen or found wrong; ``points`` (N, 3),
-    NaN where not placed; ``cams`` world_from_cam of the registered views: lever
-    arms are known in metres, and have no place here before the scale is known.
+    ``ideal`` is (N, V, 2), NaN where unseen or found wrong; ``slopes`` (N, V, 2, 2)
+    goes with it; ``points`` (N, 3), NaN where not placed; ``cams`` world_from_cam
+    of the registered views: lever arms are known in metres, and have no place
+    here before the scale is known.
     """
 
     ideal: Array
+    slopes: Array
     points: Array
     cams: dict[int, Pose]
 
@@ -266,6 +274,7 @@ def _build(
     ideal = ideal_of_pixels(observed, [d.camera for d in drones])
     scene = _Scene(
         ideal,
+        slopes_of_ideal(ideal, [d.camera for d in drones]),
         np.full((len(ideal), 3), np.nan),
         {pair[0]: Pose.identity(), pair[1]: chosen.b_from_a.inverse()},
     )
@@ -294,10 +303,11 @@ def _adjusted(drones: list[DroneView], scene: _Scene, options: MapOptions) -> _S
         adjusted, _ = adjust(views, BundleOptions())
         points = np.full_like(points, np.nan)
         points[good] = adjusted.points
-        scene = _Scene(ideal, points, dict(zip(used, adjusted.bodies, strict=True)))
+        cams = dict(zip(used, adjusted.bodies, strict=True))
+        scene = replace(scene, ideal=ideal, points=points, cams=cams)
     ideal, good = _culled(drones, scene, options.max_error_px, options)
     points = np.where(good[:, None], scene.points, np.nan)
-    return _Scene(ideal, points, scene.cams)
+    return replace(scene, ideal=ideal, points=points)
 
 
 def _held(views: Views) -> Views:
@@ -312,7 +322,7 @@ def _views(drones: list[DroneView], scene: _Scene, good: NDArray[np.bool_]) -> V
     return Views(
         bodies=tuple(scene.cams[i] for i in used),
         mountings=(Pose.identity(),) * len(used),
-        focal_px=np.array([drones[i].camera.focal_px for i in used]),
+        slopes=scene.slopes[good][:, used],
         ideal=scene.ideal[good][:, used],
         points=scene.points[good],
         distances=(),
@@ -350,6 +360,7 @@ def _register_next(drones: list[DroneView], scene: _Scene, options: MapOptions) 
             scene.points[index],
             np.zeros((len(index), 3, 3)),
             drones[i].camera.focal_px,
+            scene.slopes[index, i],
             Pose.identity(),
             1.0,
             np.zeros(len(index)),

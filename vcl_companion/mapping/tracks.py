@@ -74,3 +74,8 @@ def ideal_of_pixels(observed_px: Array, cameras: list[Camera]) -> Array:
         seen = np.isfinite(observed_px[:, i, 0])
         out[seen, i] = camera.ideal_from_pixels(observed_px[seen, i])
     return out
+
+
+def slopes_of_ideal(ideal: Array, cameras: list[Camera]) -> Array:
+    """Return (N, V, 2, 2) d(pixel) / d(ideal) at (N, V, 2) ideal coordinates; NaN where unseen."""
+    return np.stack([camera.pixel_slopes(ideal[:, i]) for i, camera in enumerate(cameras)], axis=1)

@@ -15,7 +15,7 @@ import numpy as np
 
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import LandmarkMap
-from vcl_companion.mapping.tracks import ideal_of_pixels
+from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.vision.bundle import Distance, Views, normal_equations
 
 # Smallest eigenvalue of an information matrix with ones on its diagonal; rounding leaves 1e-16.
@@ -47,11 +47,13 @@ class MapUncertainty:
 def views_of(landmark_map: LandmarkMap) -> Views:
     """Return the map as the bundle adjustment sees it."""
     keyframes = landmark_map.keyframes
+    cameras = [k.camera for k in keyframes]
+    ideal = ideal_of_pixels(landmark_map.observed_px, cameras)
     return Views(
         bodies=tuple(k.world_from_body for k in keyframes),
         mountings=tuple(k.body_from_cam for k in keyframes),
-        focal_px=np.array([k.camera.focal_px for k in keyframes]),
-        ideal=ideal_of_pixels(landmark_map.observed_px, [k.camera for k in keyframes]),
+        slopes=slopes_of_ideal(ideal, cameras),
+        ideal=ideal,
         points=landmark_map.points_world,
         distances=tuple(
             Distance(d.keyframe_a, d.keyframe_b, d.distance_m, d.sigma_m)
@@ -74,7 +76,7 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
     with np.errstate(all="ignore"):
         views = views_of(landmark_map)
         # Distances enter in units of their own sigma; pixels in px: bring both to sigmas.
-        scaled = replace(views, focal_px=views.focal_px / landmark_map.pixel_noise_px)
+        scaled = replace(views, slopes=views.slopes / landmark_map.pixel_noise_px)
         system = normal_equations(scaled, None)
         inverse = _inverse(system.point_block)
         lever = -np.swapaxes(system.cross @ inverse, 1, 2)

@@ -35,7 +35,8 @@ class Views:
     Attributes:
         bodies: V world_from_body poses; the first is held fixed.
         mountings: V body_from_cam poses.
-        focal_px: (V,) px per unit of the ideal image plane, to weigh residuals in px.
+        slopes: (N, V, 2, 2) d(pixel) / d(ideal) at the observations, by which
+            residuals are in pixels of the raw image, where the noise is the same everywhere.
         ideal: (N, V, 2) observations as ideal image coordinates x/z, y/z; NaN where unseen.
         points: (N, 3) landmarks, world frame, m.
         distances: what fixes the scale.
@@ -43,7 +44,7 @@ class Views:
 
     bodies: tuple[Pose, ...]
     mountings: tuple[Pose, ...]
-    focal_px: Array
+    slopes: Array
     ideal: Array
     points: Array
     distances: tuple[Distance, ...]
@@ -89,7 +90,8 @@ def reprojection_residuals(views: Views) -> Array:
     for i in range(len(views.bodies)):
         points_cam = _world_from_cam(views, i).inverse().apply(views.points)
         z = np.where(points_cam[:, 2] > _MIN_DEPTH_M, points_cam[:, 2], np.nan)
-        out[:, i] = (points_cam[:, :2] / z[:, None] - views.ideal[:, i]) * views.focal_px[i]
+        error = points_cam[:, :2] / z[:, None] - views.ideal[:, i]
+        out[:, i] = np.einsum("nkl,nl->nk", views.slopes[:, i], error)
     return out
 
 
@@ -165,7 +167,7 @@ def normal_equations(views: Views, cauchy_px: float | None) -> NormalEquations:
         residual, j_pose, j_point = linearized(
             views.bodies[i],
             views.mountings[i],
-            views.focal_px[i],
+            views.slopes[seen, i],
             views.points[seen],
             views.ideal[seen, i],
         )
@@ -185,14 +187,14 @@ def normal_equations(views: Views, cauchy_px: float | None) -> NormalEquations:
 
 
 def linearized(
-    world_from_body: Pose, body_from_cam: Pose, focal_px: float, points: Array, ideal: Array
+    world_from_body: Pose, body_from_cam: Pose, slopes: Array, points: Array, ideal: Array
 ) -> tuple[Array, Array, Array]:
     """Residuals of one view and their Jacobians.
 
     Args:
         world_from_body: the view's pose, perturbed locally.
         body_from_cam: its mounting.
-        focal_px: px per ideal unit.
+        slopes: (N, 2, 2) d(pixel) / d(ideal) at the observations.
         points: (N, 3) landmarks, world frame, m.
         ideal: (N, 2) where they were seen, ideal coordinates.
 
@@ -207,11 +209,11 @@ def linearized(
     points_body = np.where(front[:, None], points_body, 0.0)
     z = np.where(front, points_cam[:, 2], 1.0)
     uv = points_cam[:, :2] / z[:, None]
-    residual = (uv - ideal) * focal_px
+    residual = np.einsum("nkl,nl->nk", slopes, uv - ideal)
     residual[~front] = 1e3
-    j_cam = np.zeros((len(points), 2, 3))
-    j_cam[:, 0, 0] = j_cam[:, 1, 1] = focal_px / z
-    j_cam[:, :, 2] = -focal_px * uv / z[:, None]
+    j_cam = np.empty((len(points), 2, 3))
+    j_cam[:, :, :2] = slopes / z[:, None, None]
+    j_cam[:, :, 2] = -np.einsum("nkl,nl->nk", slopes, uv) / z[:, None]
     j_cam[~front] = 0.0
     j_body = j_cam @ cam_from_body
     j_pose = np.empty((len(points), 2, 6))

@@ -26,6 +26,8 @@ _MAX_LEVERAGE = 0.4
 # noise in two dimensions: E[w^2 s/2] E[w]^2 / (E[w + s w']^2 E[w^2]) with w = (1 + s/4)^-2.
 _ROBUST_LOSS = 1.1136
 _MAX_ROUNDS = 3
+# Smallest eigenvalue of a normal matrix, scaled to a diagonal of ones, that is no rounding.
+_SINGULAR = 1e-9
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,8 @@ class Sightings:
         ideal: (M, 2) where they were seen, ideal image coordinates x/z, y/z.
         points: (M, 3) landmarks, world frame, m.
         point_covariances: (M, 3, 3) of the landmarks, world frame, m^2.
-        focal_px: px per ideal unit.
+        focal_px: px per ideal unit, near enough for the search.
+        slopes: (M, 2, 2) d(pixel) / d(ideal) at each sighting.
         body_from_cam: the camera's mounting.
         noise_px: 1-sigma of one pixel coordinate, new in every image.
         bias_px: (M,) 1-sigma of what a detector misplaces each of them by because
@@ -68,6 +71,7 @@ class Sightings:
     points: Array
     point_covariances: Array
     focal_px: float
+    slopes: Array
     body_from_cam: Pose
     noise_px: float
     bias_px: Array
@@ -191,7 +195,7 @@ def _converged(pose: Pose, sightings: Sightings) -> Pose | NotFound:
             if not np.isfinite(length) or length > 1e3:
                 return NotFound("the refinement of the pose diverged")
             pose = pose.retracted(step)
-            if length < 1e-7:
+            if length < (1e-4 if scale > 1.0 else 1e-7):
                 break
     return pose
 
@@ -208,10 +212,12 @@ def _supported(
     if n_inliers < options.min_inliers:
         return NotFound(f"{n_inliers} landmarks agree on a pose, {options.min_inliers} needed")
     weighted = _weighted(residual[inliers], j_pose[inliers], information[inliers])
-    try:
-        inverse = np.linalg.inv(np.einsum("nik,nkj->ij", weighted, j_pose[inliers]))
-    except np.linalg.LinAlgError:
+    normal = np.einsum("nik,nkj->ij", weighted, j_pose[inliers])
+    size = np.sqrt(np.diag(normal))
+    unit = normal / np.maximum(np.outer(size, size), 1e-300)
+    if not np.linalg.eigvalsh(unit)[0] > _SINGULAR:
         return NotFound("the matched landmarks do not fix a pose")
+    inverse = np.linalg.inv(normal)
     gain = np.einsum("ij,njk->nik", inverse, weighted)
     by_landmark = gain @ np.swapaxes(gain, 1, 2)
     return Resection(
@@ -239,6 +245,7 @@ def _of(sightings: Sightings, chosen: Mask) -> Sightings:
         points=sightings.points[chosen],
         point_covariances=sightings.point_covariances[chosen],
         bias_px=sightings.bias_px[chosen],
+        slopes=sightings.slopes[chosen],
     )
 
 
@@ -252,7 +259,7 @@ def _weighted(residual: Array, j_pose: Array, information: Array) -> Array:
 
 def _linearized(pose: Pose, sightings: Sightings) -> tuple[Array, Array, Array]:
     return linearized(
-        pose, sightings.body_from_cam, sightings.focal_px, sightings.points, sightings.ideal
+        pose, sightings.body_from_cam, sightings.slopes, sightings.points, sightings.ideal
     )
 
 
