@@ -163,6 +163,7 @@ def test_maps_out_of_bounds_are_not_encoded() -> None:
         "not a known distance": replace(m, distances=(KnownDistance(0, 1, float("nan"), 0.1),)),
         "out of range": replace(m, keyframes=(far, m.keyframes[1])),
         "image side": _with_camera(m, Camera(9000, 480, 400.0, 400.0, 320.0, 240.0)),
+        "in all": _with_camera(m, Camera(2100, 2000, 900.0, 900.0, 1050.0, 1000.0)),
         "focal lengths": _with_camera(m, Camera(640, 480, 1e300, 400.0, 320.0, 240.0)),
     }
     for reason, broken in cases.items():

@@ -246,7 +246,7 @@ def _check_distance(distance: KnownDistance) -> None:
     if not (
         all(map(math.isfinite, numbers))
         and 0 < distance.distance_m <= 2 * MAX_COORDINATE_M
-        and distance.sigma_m >= 0
+        and distance.sigma_m > 0
         and distance.keyframe_a != distance.keyframe_b
     ):
         raise ValueError(f"not a known distance: {distance}")

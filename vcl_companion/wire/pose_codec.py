@@ -21,6 +21,8 @@ from vcl_companion.wire.reader import Reader
 
 MAX_COORDINATE_M = 32_000.0
 MAX_IMAGE_SIDE_PX = 8192
+# Finding features takes some 400 bytes a pixel: a peer must not make it gigabytes.
+MAX_IMAGE_PX = 1 << 22
 MAX_IMAGE_BYTES = 1024 * 1024
 
 _UNIT = 1 << 30
@@ -151,6 +153,10 @@ def _check_camera(camera: Camera) -> None:
     if side > MAX_IMAGE_SIDE_PX:
         raise ValueError(f"camera: image side {side} px, at most {MAX_IMAGE_SIDE_PX}")
     focal = (camera.fx_px, camera.fy_px)
+    if camera.width_px * camera.height_px > MAX_IMAGE_PX:
+        raise ValueError(
+            f"camera: {camera.width_px}x{camera.height_px} px, at most {MAX_IMAGE_PX} in all"
+        )
     if min(focal) < 0.01 * side or max(focal) > 1000.0 * side:
         raise ValueError(f"camera: focal lengths {focal} px for an image side of {side} px")
     if max(abs(camera.cx_px), abs(camera.cy_px)) > 10.0 * side:
