@@ -89,6 +89,10 @@ class Camera:
         What weighs a residual of ideal coordinates as the detector's noise does:
         towards the edge of a wide lens a pixel is many times as large there.
         """
+        if self.distortion_model == "none":
+            slopes = np.zeros((len(ideal), 2, 2))
+            slopes[:, 0, 0], slopes[:, 1, 1] = self.fx_px, self.fy_px
+            return slopes
         step = 1e-6
         columns = [
             (self.pixels_from_ideal(ideal + shift) - self.pixels_from_ideal(ideal - shift))
