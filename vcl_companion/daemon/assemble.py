@@ -7,6 +7,7 @@ import logging
 import resource
 import signal
 import time
+from collections.abc import Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -15,7 +16,6 @@ import cv2
 import numpy as np
 
 from vcl_companion.cameras.open import open_camera
-from vcl_companion.cameras.source import CameraSource
 from vcl_companion.clock import Clock, ManualClock, SystemClock
 from vcl_companion.config import Config
 from vcl_companion.daemon import notify
@@ -33,6 +33,10 @@ from vcl_companion.swarm.transfer import Transfers
 
 _log = logging.getLogger(__name__)
 
+# A device that does not let go must not keep the flight log from its summary.
+_CLOSE_S = 3.0
+_END_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+
 
 def run_daemon(config: Config) -> int:
     """Run one drone's service until SIGTERM, Ctrl-C or the end of the camera's stream.
@@ -49,7 +53,13 @@ def run_daemon(config: Config) -> int:
     # One core per thing: several daemons may share a machine, and OpenCV's own
     # threads make features depend on their number.
     cv2.setNumThreads(1)
-    return asyncio.run(_run(config))
+    try:
+        return asyncio.run(_run(config))
+    finally:
+        # The interpreter gives handlers back to the system before it has ended:
+        # a second SIGTERM must not kill what is about to end cleanly.
+        for number in _END_SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
 
 
 async def _run(config: Config) -> int:
@@ -62,7 +72,7 @@ async def _run(config: Config) -> int:
 
     # Not the loop's own handlers: those vanish with it, and a second SIGTERM
     # would then kill a daemon that is about to end cleanly.
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in _END_SIGNALS:
         signal.signal(number, end)
     clock: Clock = ManualClock() if config.clock == "camera" else SystemClock()
     sensor = read_sensor(Path(config.camera.calibration))
@@ -75,10 +85,11 @@ async def _run(config: Config) -> int:
     # Frames never wait for a map that is being built: one thread for each.
     vision = ThreadPoolExecutor(1, "vision")
     mapping = ThreadPoolExecutor(1, "mapping")
+    rng = np.random.default_rng()
     exchange = Exchange(
         config.system_id,
         group,
-        Transfers(config.transfer, np.random.default_rng()),
+        Transfers(config.transfer, rng),
         maps,
         autopilot,
         sensor,
@@ -87,6 +98,7 @@ async def _run(config: Config) -> int:
         mapping,
         lambda: companion.is_localized,
         ExchangeOptions(config.swarm, config.map, config.features, config.localization.detector),
+        rng,
     )
     companion = Companion(
         camera,
@@ -110,58 +122,60 @@ async def _run(config: Config) -> int:
     exchange.attach(peers)
     began_at_s = time.monotonic()
     try:
-        await _until_ended(ended, camera, companion, autopilot, peers, exchange, health)
-    finally:
-        notify.stopping()
-        await camera.close()
-        vision.shutdown(wait=False, cancel_futures=True)
-        mapping.shutdown(wait=False, cancel_futures=True)
-        usage = resource.getrusage(resource.RUSAGE_SELF)
-        log.close(
-            cpu_s=usage.ru_utime + usage.ru_stime,
-            wall_s=time.monotonic() - began_at_s,
-            resident_mb=usage.ru_maxrss / 1024,
-            peer_bytes_sent=peers.counters.bytes_out,
-            peer_bytes_received=peers.counters.bytes_in,
-        )
-    return 0
-
-
-async def _until_ended(
-    ended: asyncio.Event,
-    camera: CameraSource,
-    companion: Companion,
-    autopilot: AutopilotLink,
-    peers: PeerLink,
-    exchange: Exchange,
-    health: Health,
-) -> None:
-    """Run every part until the end is asked for; the first that fails ends all."""
-    tasks = [
-        asyncio.ensure_future(part)
-        for part in (
+        await _until_ended(
+            ended,
             autopilot.run(),
             peers.run(),
             exchange.run(),
             companion.run(),
             health.run(),
+            ends_all=companion.read_camera(),
         )
-    ]
-    reading = asyncio.ensure_future(companion.read_camera())
+    finally:
+        try:
+            companion.end()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(_CLOSE_S):
+                    await camera.close()
+        finally:
+            # What runs is not waited for here; the process ends when it is done.
+            vision.shutdown(wait=False, cancel_futures=True)
+            mapping.shutdown(wait=False, cancel_futures=True)
+            usage = resource.getrusage(resource.RUSAGE_SELF)
+            log.close(
+                cpu_s=usage.ru_utime + usage.ru_stime,
+                wall_s=time.monotonic() - began_at_s,
+                resident_mb=usage.ru_maxrss / 1024,
+                peer_bytes_sent=peers.counters.bytes_out,
+                peer_bytes_received=peers.counters.bytes_in,
+            )
+    return 0
+
+
+async def _until_ended(
+    ended: asyncio.Event,
+    *parts: Coroutine[None, None, None],
+    ends_all: Coroutine[None, None, None],
+) -> None:
+    """Run every part until the end is asked for, or ``ends_all`` is done, or one fails."""
+    tasks = [asyncio.ensure_future(part) for part in (*parts, ends_all)]
     stop = asyncio.ensure_future(ended.wait())
     notify.ready()
     try:
-        done, _ = await asyncio.wait({*tasks, reading, stop}, return_when=asyncio.FIRST_COMPLETED)
-        if reading in done and reading.exception() is None and stop not in done:
-            _log.info("the camera's stream is over")
-            await companion.idle()
+        await asyncio.wait({*tasks, stop}, return_when=asyncio.FIRST_COMPLETED)
     finally:
-        for task in (*tasks, reading, stop):
+        notify.stopping()
+        for task in (*tasks, stop):
             task.cancel()
-        results = await asyncio.gather(*tasks, reading, return_exceptions=True)
+        results = await asyncio.gather(*tasks, return_exceptions=True)
     for result in results:
         if isinstance(result, BaseException) and not isinstance(result, asyncio.CancelledError):
-            raise _first_cause(result)
+            cause = _first_cause(result)
+            if ended.is_set() and isinstance(cause, VclError):
+                # Who ends us may hang up at the same moment.
+                _log.warning("while ending: %s", cause)
+                continue
+            raise cause
 
 
 def _first_cause(error: BaseException) -> BaseException:

@@ -38,8 +38,10 @@ _log = logging.getLogger(__name__)
 
 # How long an attitude sample may still be on its way when its frame is here.
 ATTITUDE_WAIT_S = 0.1
-_LOOK_S = 0.05
-_IDLE_S = 5.0
+# How long the last frames of a stream may take.
+_LAST_FRAMES_S = 5.0
+# A fix this old is no more where we are.
+_FRESH_NS = 2_000_000_000
 
 
 @dataclass(frozen=True)
@@ -94,30 +96,41 @@ class Companion:
         self._state: FilterState | None = None
         self._n_resets = 0
         self._last_sequence: int | None = None
-        self._n_open = 0
+        self._open: list[Frame] = []
+        self._over = asyncio.Event()
+        self._answered = asyncio.Event()
 
     @property
     def is_localized(self) -> bool:
-        """Whether there is a state that a fix has started."""
-        return self._state is not None
+        """Whether a frame of the last two seconds gave a pose."""
+        state = self._state
+        return state is not None and self._clock.now_ns() - state.fixed_at_ns <= _FRESH_NS
 
     async def read_camera(self) -> None:
-        """Move frames from the camera to the mailbox until the stream ends."""
+        """Move frames from the camera to the mailbox until the stream ends and all are answered.
+
+        A frame that still waits for a first map then is answered at once, one
+        that is being localized when that is done.
+        """
         async for frame in self._camera.frames():
             self._note_gap(frame)
-            self._n_open += 1
+            self._open.append(frame)
             replaced = self._mailbox.put(frame)
             if replaced is not None:
                 self._drop(replaced)
             self._on_frame(frame)
-
-    async def idle(self) -> None:
-        """Wait, not for long, until every frame that came is answered."""
-        self._maps.refuse("the camera's stream is over")
+        _log.info("the camera's stream is over")
+        self._over.set()
         with suppress(TimeoutError):
-            async with asyncio.timeout(_IDLE_S):
-                while self._n_open > 0:
-                    await asyncio.sleep(_LOOK_S)
+            async with asyncio.timeout(_LAST_FRAMES_S):
+                while self._open:
+                    self._answered.clear()
+                    await self._answered.wait()
+
+    def end(self) -> None:
+        """Answer what is still open as the service ends; nothing else may run any more."""
+        for frame in list(self._open):
+            self._log_refused(frame, NotLocalized("the service has ended"))
 
     async def run(self) -> None:
         """Localize frames until cancelled."""
@@ -129,18 +142,22 @@ class Companion:
 
     async def _first_map(self, frame: Frame) -> StoredMap | None:
         """Wait for a first map as long as no newer frame comes; answer the frame if none does."""
-        self._health.waiting_for_map()
         decided = asyncio.ensure_future(self._maps.decided())
         newer = asyncio.ensure_future(self._mailbox.filled())
+        over = asyncio.ensure_future(self._over.wait())
         try:
-            await asyncio.wait({decided, newer}, return_when=asyncio.FIRST_COMPLETED)
-            if decided.done() and decided.result() is not None:
-                return decided.result()
+            with self._health.waiting_for_map():
+                await asyncio.wait({decided, newer, over}, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            decided.cancel()
-            newer.cancel()
-        self._refuse(frame, NotLocalized(f"no map: {self._maps.refusal or 'none yet'}"))
-        return None
+            for waiting in (decided, newer, over):
+                waiting.cancel()
+        if self._maps.current is None:
+            self._refuse(frame, self._no_map())
+        return self._maps.current
+
+    def _no_map(self) -> NotLocalized:
+        ended = "the camera's stream is over" if self._over.is_set() else "none yet"
+        return NotLocalized(f"no map: {self._maps.refusal or ended}")
 
     async def _localize(self, frame: Frame, stored: StoredMap) -> None:
         loop = asyncio.get_running_loop()
@@ -220,6 +237,9 @@ class Companion:
     def _refuse(self, frame: Frame, why: NotLocalized) -> None:
         """Send nothing, and say why."""
         self._health.refused(why.reason)
+        self._log_refused(frame, why)
+
+    def _log_refused(self, frame: Frame, why: NotLocalized) -> None:
         self._log.frame(
             frame.sequence,
             frame.captured_at_ns,
@@ -235,19 +255,20 @@ class Companion:
     def _drop(self, frame: Frame) -> None:
         """Answer a frame whose place a newer one took before it was looked at."""
         if self._maps.current is None:
-            self._refuse(frame, NotLocalized(f"no map: {self._maps.refusal or 'none yet'}"))
+            self._refuse(frame, self._no_map())
             return
         self._log.frame(frame.sequence, frame.captured_at_ns, "dropped")
         self._answer(frame, "dropped")
 
     def _answer(self, frame: Frame, outcome: Outcome) -> None:
-        self._n_open -= 1
+        self._open.remove(frame)
+        self._answered.set()
         self._camera.done(frame.sequence, outcome)
 
     def _note_gap(self, frame: Frame) -> None:
         """Count frames that the camera's driver dropped before us."""
         if self._last_sequence is not None and frame.sequence > self._last_sequence + 1:
-            self._log.frames["dropped"] += frame.sequence - self._last_sequence - 1
+            self._log.missed(frame.sequence - self._last_sequence - 1)
         self._last_sequence = frame.sequence
 
     def _latency_ms(self, frame: Frame) -> float:

@@ -8,9 +8,12 @@ next one begins with a newer frame.
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Awaitable, Callable
 from concurrent.futures import Executor
 from contextlib import suppress
+
+import numpy as np
 
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
@@ -25,8 +28,12 @@ from vcl_companion.vision.features import FeatureOptions, detect
 from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.messages import FrameRequest
 
+_log = logging.getLogger(__name__)
+
 _ASK_AGAIN_S = 1.0
 _LOOK_S = 0.1
+# A camera that delivers nothing new has nothing for a first map either.
+_STALE_NS = 60 * 1_000_000_000
 
 Distances = tuple[tuple[int, int, float], ...]
 
@@ -91,6 +98,8 @@ class FirstMap:
         known_distances: (drone, drone, metres).
         map_options: thresholds.
         features: how they are found.
+        rng: numbers the requests, so that a restarted coordinator's are not
+            taken for those of its earlier life.
     """
 
     def __init__(
@@ -107,6 +116,7 @@ class FirstMap:
         known_distances: Distances,
         map_options: MapOptions,
         features: FeatureOptions,
+        rng: np.random.Generator,
     ) -> None:
         self._system_id = system_id
         self._group = group
@@ -120,7 +130,7 @@ class FirstMap:
         self._known_distances = known_distances
         self._map_options = map_options
         self._features = features
-        self._request_id = 0
+        self._request_id = int(rng.integers(1 << 32))
         self._gathered: dict[int, FrameAnswer] = {}
         self._came = asyncio.Event()
 
@@ -136,59 +146,82 @@ class FirstMap:
     async def run(self) -> None:
         """Make rounds until cancelled; each needs a frame that was not tried before."""
         began_at_s = asyncio.get_running_loop().time()
-        tried = -1
+        tried: Frame | None = None
         while True:
             frame = self._frames.newest
-            if frame is None or frame.sequence <= tried or not self._is_due(began_at_s):
+            if frame is None or frame is tried or not self._is_due(frame, began_at_s):
                 await asyncio.sleep(_LOOK_S)
                 continue
-            tried = frame.sequence
+            tried = frame
             await self._round(frame)
 
-    def _is_due(self, began_at_s: float) -> bool:
+    def _is_due(self, frame: Frame, began_at_s: float) -> bool:
         """Whether a first map is ours to make, and everybody is there or was waited for."""
-        if self._maps.current is not None or not self._group.is_coordinator:
+        if self._has_map() or not self._group.is_coordinator:
             return False
-        states = map(self._group.state_of, self._group.peers)
-        if any(state is not None and state.revision for state in states):
-            return False  # we are late, or back: a peer will send us its map
-        if self._group.is_complete:
-            return True
+        if self._clock.now_ns() - frame.captured_at_ns > _STALE_NS:
+            return False
         waited_s = asyncio.get_running_loop().time() - began_at_s
-        return waited_s >= self._map_options.member_wait_s
+        if waited_s >= self._map_options.member_wait_s:
+            return True
+        # Who is heard but has not said yet what it flies on may well have a map.
+        told = all(self._group.state_of(peer) is not None for peer in self._group.peers)
+        return self._group.is_complete and told
+
+    def _has_map(self) -> bool:
+        """Whether there is a map: ours, or of a peer, which will send it (we are late, or back)."""
+        states = map(self._group.state_of, self._group.peers)
+        return self._maps.current is not None or any(s is not None and s.revision for s in states)
 
     async def _round(self, frame: Frame) -> None:
+        self._request_id = (self._request_id + 1) % (1 << 32)
+        built: LandmarkMap | NoMap
+        try:
+            own = await self._describe(frame, self._request_id)
+        except ValueError as error:
+            built = NoMap(f"our own frame: {error}")
+        else:
+            self._gathered = {self._system_id: own}
+            await self._gather(frame)
+            frames, self._gathered = list(self._gathered.values()), {}
+            built = await self._built(frames)
+        if not self._has_map():
+            await self._decide(built, self._request_id)
+
+    async def _built(self, frames: list[FrameAnswer]) -> LandmarkMap | NoMap:
         loop = asyncio.get_running_loop()
-        self._request_id += 1
-        own = await self._describe(frame, self._request_id)
-        self._gathered = {self._system_id: own}
-        await self._gather(frame)
-        frames, self._gathered = list(self._gathered.values()), {}
-        built = await loop.run_in_executor(
-            self._executor,
-            build_map,
-            frames,
-            self._group.leader,
-            self._known_distances,
-            self._map_options,
-            self._features,
-        )
-        await self._decide(built, self._request_id)
+        try:
+            return await loop.run_in_executor(
+                self._executor,
+                build_map,
+                frames,
+                self._group.leader,
+                self._known_distances,
+                self._map_options,
+                self._features,
+            )
+        except Exception as error:
+            # Peers' images and numbers went in: none of them may end the flight.
+            _log.exception("the first map cannot be built")
+            return NoMap(f"building failed: {type(error).__name__}")
 
     async def _gather(self, frame: Frame) -> None:
         """Ask those who have not answered, again and again, until all have or time is up."""
         with suppress(TimeoutError):
             async with asyncio.timeout(self._map_options.gather_timeout_s):
-                while missing := [p for p in self._group.alive if p not in self._gathered]:
+                while self._missing() and not self._has_map():
                     age_s = (self._clock.now_ns() - frame.captured_at_ns) * 1e-9
-                    for peer in missing:
+                    for peer in self._missing():
                         self._ask(FrameRequest(self._request_id, max(age_s, 0.0)), peer)
                     await self._news(_ASK_AGAIN_S)
+
+    def _missing(self) -> list[int]:
+        return [peer for peer in self._group.alive if peer not in self._gathered]
 
     async def _news(self, at_most_s: float) -> None:
         """Wait until every member alive has answered, or it is time to ask again."""
         with suppress(TimeoutError):
             async with asyncio.timeout(at_most_s):
-                while any(p not in self._gathered for p in self._group.alive):
+                while self._missing():
                     self._came.clear()
                     await self._came.wait()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
@@ -13,6 +14,10 @@ from vcl_companion.clock import Clock
 from vcl_companion.errors import ConfigError
 
 _log = logging.getLogger(__name__)
+
+# Reasons hold numbers, and some are a peer's words: beyond so many they share one count.
+_MAX_REASONS = 200
+_OTHER_REASONS = "other reasons"
 
 
 class FlightLog:
@@ -35,8 +40,9 @@ class FlightLog:
             try:
                 Path(path).parent.mkdir(parents=True, exist_ok=True)
                 self._file = open(path, "w", encoding="utf-8", buffering=1)  # noqa: SIM115 kept open
-            except OSError as error:
-                raise ConfigError(f"[log] flight_log {path}: {error.strerror}") from error
+            except (OSError, ValueError) as error:
+                why = getattr(error, "strerror", None) or error
+                raise ConfigError(f"[log] flight_log {path!r}: {why}") from error
 
     def frame(
         self,
@@ -52,7 +58,8 @@ class FlightLog:
         """Write what became of a frame."""
         self.frames[outcome] += 1
         if outcome == "refused":
-            self.refusals[reason] += 1
+            known = reason in self.refusals or len(self.refusals) < _MAX_REASONS
+            self.refusals[reason if known else _OTHER_REASONS] += 1
         self._write(
             kind="frame",
             sequence=sequence,
@@ -63,6 +70,10 @@ class FlightLog:
             matched=matched,
             inliers=inliers,
         )
+
+    def missed(self, n_frames: int) -> None:
+        """Count frames that were dropped before they reached us; of these there are no lines."""
+        self.frames["dropped"] += n_frames
 
     def event(self, event: str, reason: str) -> None:
         """Write something that changed."""
@@ -80,13 +91,11 @@ class FlightLog:
         )
 
     def close(self, **summary: float) -> None:
-        """Write the totals and let go of the file."""
+        """Write the totals and let go of the file; what comes later is not written."""
         self._write(
             kind="summary", frames=dict(self.frames), refusals=dict(self.refusals), **summary
         )
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        self._let_go()
 
     def _write(self, **record: object) -> None:
         if self._file is None:
@@ -95,4 +104,10 @@ class FlightLog:
             self._file.write(json.dumps(record) + "\n")
         except OSError as error:  # a full disk must not end the flight
             _log.error("the flight log ends here: %s", error.strerror)
-            self._file = None
+            self._let_go()
+
+    def _let_go(self) -> None:
+        file, self._file = self._file, None
+        if file is not None:
+            with suppress(OSError):  # it tries once more to write what it could not
+                file.close()

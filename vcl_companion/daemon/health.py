@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from vcl_companion.daemon import notify
 from vcl_companion.daemon.flight_log import FlightLog
@@ -50,18 +52,23 @@ class Health:
         elif now_s - self._last_fix_s >= _LOST_S or self._state is ServiceState.CRITICAL:
             self._tell(ServiceState.CRITICAL, Severity.WARNING, f"lost: {reason}", "lost")
 
-    def waiting_for_map(self) -> None:
-        """Note that a frame waits for the first map: alive, though nothing is answered."""
-        self._last_answer_s = asyncio.get_running_loop().time()
+    @contextmanager
+    def waiting_for_map(self) -> Iterator[None]:
+        """Hold on while a frame waits for the first map: nothing is answered, and nothing hangs."""
         if self._state is ServiceState.STARTING:
             self._tell(ServiceState.STANDBY, Severity.INFO, "waiting for a map", "waiting")
+        self._last_answer_s = None
+        try:
+            yield
+        finally:
+            self._last_answer_s = asyncio.get_running_loop().time()
 
     async def run(self) -> None:
         """Feed systemd's watchdog while frames are answered; fall silent when they are not."""
         while True:
             await asyncio.sleep(_CHECK_S)
             if self._last_answer_s is None:
-                notify.watchdog()  # no frame yet: the camera's own errors end the service
+                notify.watchdog()  # no frame to answer: the camera's own errors end the service
                 continue
             idle_s = asyncio.get_running_loop().time() - self._last_answer_s
             if idle_s < _STALLED_S:

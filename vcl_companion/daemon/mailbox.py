@@ -1,10 +1,13 @@
-"""One place for one frame: fresh beats complete."""
+"""Where things wait for the one who takes them: fresh beats complete, nothing piles up."""
 
 from __future__ import annotations
 
 import asyncio
+from typing import Generic, TypeVar
 
 from vcl_companion.cameras.source import Frame
+
+_Item = TypeVar("_Item")
 
 
 class Mailbox:
@@ -27,9 +30,33 @@ class Mailbox:
             await self._filled.wait()
 
     async def take(self) -> Frame:
-        """Wait for a frame and take it out; one taker at a time."""
-        await self.filled()
-        if self._frame is None:
-            raise RuntimeError("two takers at one mailbox")
+        """Wait for a frame and take it out; of several takers one gets it."""
+        while self._frame is None:
+            await self.filled()
         frame, self._frame = self._frame, None
         return frame
+
+
+class PeerMailbox(Generic[_Item]):
+    """Holds the newest thing of each peer; peers are served in turn.
+
+    However much a peer sends, one item of it waits: the work that peers can
+    cause is bounded by how fast it is taken.
+    """
+
+    def __init__(self) -> None:
+        self._items: dict[int, _Item] = {}
+        self._filled = asyncio.Event()
+
+    def put(self, peer: int, item: _Item) -> None:
+        """Leave something of a peer, in the place of what it had left before."""
+        self._items[peer] = item
+        self._filled.set()
+
+    async def take(self) -> tuple[int, _Item]:
+        """Wait for something, and take out what came from the peer that waits longest."""
+        while not self._items:
+            self._filled.clear()
+            await self._filled.wait()
+        peer = next(iter(self._items))
+        return peer, self._items.pop(peer)

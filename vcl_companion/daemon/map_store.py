@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
+import tempfile
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,7 +44,7 @@ class MapStore:
         directory: where every revision is kept as ``<revision>.vclmap``; empty for nowhere.
 
     Raises:
-        ConfigError: the directory cannot be made.
+        ConfigError: the directory cannot be made, or no file in it.
     """
 
     def __init__(self, directory: str) -> None:
@@ -52,8 +55,12 @@ class MapStore:
         if self._directory is not None:
             try:
                 self._directory.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise ConfigError(f"[map] directory {directory}: {error.strerror}") from error
+                # Permission bits do not tell of read-only or odd file systems: try.
+                with tempfile.TemporaryFile(dir=self._directory):
+                    pass
+            except (OSError, ValueError) as error:
+                why = getattr(error, "strerror", None) or error
+                raise ConfigError(f"[map] directory {directory!r}: {why}") from error
 
     def replace(self, data: bytes, index: MapIndex) -> StoredMap:
         """Fly on this map from the next frame on."""
@@ -61,8 +68,6 @@ class MapStore:
         self.current = stored
         self.refusal = ""
         self._decided.set()
-        if self._directory is not None:
-            self._save(self._directory / f"{stored.revision.hex()}.vclmap", data)
         return stored
 
     def refuse(self, reason: str) -> None:
@@ -78,11 +83,24 @@ class MapStore:
             await self._decided.wait()
         return self.current
 
-    def _save(self, path: Path, data: bytes) -> None:
-        """Write beside and rename, so that a power cut leaves no half map."""
+    def keep(self, stored: StoredMap) -> None:
+        """Write a revision to the directory; takes as long as the disk does, any thread may.
+
+        Written beside and renamed when it is on the disk, so that a power cut
+        leaves no half map. A disk that is full must not end the flight: the
+        failure is logged.
+        """
+        if self._directory is None:
+            return
+        path = self._directory / f"{stored.revision.hex()}.vclmap"
         partial = path.with_suffix(".partial")
         try:
-            partial.write_bytes(data)
+            with open(partial, "wb") as file:
+                file.write(stored.data)
+                file.flush()
+                os.fsync(file.fileno())
             partial.replace(path)
         except OSError as error:
             _log.error("the map %s cannot be kept: %s", path, error.strerror)
+            with suppress(OSError):
+                partial.unlink()

@@ -1,0 +1,92 @@
+"""An autopilot's side of a link on loopback, played by hand-made MAVLink, and its companion's."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from typing import Any, cast
+
+import numpy as np
+
+from tests.links import wire
+from vcl_companion.clock import Clock
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.links.autopilot import AutopilotLink, AutopilotOptions
+
+_TEXT_BYTES = 50
+_LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+class Autopilot(asyncio.DatagramProtocol):
+    """Answers questions about time, measures one attitude, keeps what it is told.
+
+    Args:
+        system_id: its vehicle's.
+        boot_ns: its start, in the companion's time.
+        quaternion: (4,) w x y z, ned_from_body that it measures whenever it is asked the time.
+    """
+
+    def __init__(self, system_id: int, boot_ns: int, quaternion: Array) -> None:
+        self._system_id = system_id
+        self._boot_ns = boot_ns
+        self._quaternion = quaternion
+        self._transport: asyncio.DatagramTransport | None = None
+        self._companion: Any = None
+        self._parts: list[bytes] = []
+        self.texts: asyncio.Queue[str] = asyncio.Queue()
+        self.states: asyncio.Queue[int] = asyncio.Queue()
+        self.poses: asyncio.Queue[tuple[Any, ...]] = asyncio.Queue()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast(asyncio.DatagramTransport, transport)
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:
+        self._companion = addr
+        for seen in wire.read(data):
+            match seen.message_id:
+                case wire.TIMESYNC if seen.fields[0] == 0:
+                    at_ns = int(seen.fields[1])
+                    now_ns = at_ns - self._boot_ns
+                    self._say(wire.packed(wire.TIMESYNC, now_ns, at_ns, system=self._system_id))
+                    self.measure(at_ns, self._quaternion)
+                case wire.HEARTBEAT:
+                    self.states.put_nowait(int(seen.fields[4]))
+                case wire.STATUSTEXT:
+                    self._take_text(*seen.fields)
+                case wire.VISION_POSITION_ESTIMATE:
+                    self.poses.put_nowait(seen.fields)
+
+    def measure(self, at_ns: int, quaternion: Array) -> None:
+        """Send an attitude of an instant of the companion's time."""
+        boot_ms = (at_ns - self._boot_ns) // 1_000_000
+        fields = (boot_ms, *(float(q) for q in quaternion), 0, 0, 0, 0, 0, 0, 0)
+        self._say(wire.packed(wire.ATTITUDE_QUATERNION, *fields, system=self._system_id))
+
+    def _say(self, data: bytes) -> None:
+        assert self._transport is not None
+        self._transport.sendto(data, self._companion)
+
+    def _take_text(self, _: int, text: bytes, text_id: int, __: int) -> None:
+        self._parts.append(text.rstrip(b"\0"))
+        if text_id == 0 or len(self._parts[-1]) < _TEXT_BYTES:
+            self.texts.put_nowait(b"".join(self._parts).decode())
+            self._parts.clear()
+
+
+@contextlib.asynccontextmanager
+async def autopilot_and_link(
+    system_id: int, clock: Clock, at_ns: int, quaternion: Array = _LEVEL
+) -> AsyncIterator[tuple[Autopilot, AutopilotLink]]:
+    """An autopilot that was started 90 s before ``at_ns``, and the link to it, not yet running."""
+    loop = asyncio.get_running_loop()
+    transport, autopilot = await loop.create_datagram_endpoint(
+        lambda: Autopilot(system_id, at_ns - 90_000_000_000, quaternion),
+        local_addr=("127.0.0.1", 0),
+    )
+    try:
+        port = transport.get_extra_info("sockname")[1]
+        options = AutopilotOptions(link=f"udp:127.0.0.1:{port}")
+        yield autopilot, AutopilotLink(options, system_id, clock)
+    finally:
+        transport.close()

@@ -1,0 +1,275 @@
+"""Drones that share maps, in one process: real exchanges, links and autopilot links on loopback."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import socket
+from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.daemon import demo
+from tests.daemon.autopilot import Autopilot, autopilot_and_link
+from tests.daemon.waiting import beside, until
+from vcl_companion.cameras.source import Frame
+from vcl_companion.clock import ManualClock
+from vcl_companion.daemon.exchange import Exchange, ExchangeOptions
+from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.mavlink import Tunnel
+from vcl_companion.links.peers import PeerLink, PeerOptions
+from vcl_companion.swarm.group import Group, SwarmOptions
+from vcl_companion.swarm.transfer import (
+    BlobKind,
+    BlobReceived,
+    Event,
+    TransferOptions,
+    Transfers,
+)
+from vcl_companion.wire.chunks import Chunk, TransferStatus
+from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame
+from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
+from vcl_companion.wire.tunnel import PayloadType, decode_payload, encode_payload
+
+MESSAGE, DATA = PayloadType.MESSAGE, PayloadType.TRANSFER_DATA
+COMPANION = 197
+FAST = TransferOptions(rate_bytes_per_s=5e6, status_interval_s=0.05)
+
+
+def free_ports(n: int) -> list[int]:
+    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(n)]
+    try:
+        for s in sockets:
+            s.bind(("127.0.0.1", 0))
+        return [int(s.getsockname()[1]) for s in sockets]
+    finally:
+        for s in sockets:
+            s.close()
+
+
+class Drone:
+    """All of a daemon that deals with peers, and what it says into its log."""
+
+    def __init__(
+        self,
+        system_id: int,
+        members: tuple[int, ...],
+        peers: PeerOptions,
+        autopilot: tuple[Autopilot, AutopilotLink],
+        clock: ManualClock,
+        executor: ThreadPoolExecutor,
+        log_path: Path,
+        transfer: TransferOptions,
+        seed: int,
+    ) -> None:
+        self.system_id = system_id
+        self.autopilot, self._autopilot_link = autopilot
+        self._clock = clock
+        self._log_path = log_path
+        self._log = FlightLog(str(log_path), clock)
+        self.maps = MapStore("")
+        self.requests: list[FrameRequest] = []
+        swarm = SwarmOptions(members, demo.LEADER, demo.known_distances(1, 2))
+        rng = np.random.default_rng(seed)
+        self.exchange = Exchange(
+            system_id, Group(swarm, system_id), Transfers(transfer, rng), self.maps,
+            self._autopilot_link, demo.sensor(system_id), clock, self._log, executor,
+            lambda: False, ExchangeOptions(swarm, demo.MAP_OPTIONS, demo.FEATURES, "akaze"), rng,
+        )  # fmt: skip
+        self._link = PeerLink(
+            peers, system_id, frozenset(members), self._hear, self.exchange.on_heartbeat
+        )
+        self.exchange.attach(self._link)
+
+    async def run(self) -> None:
+        async with asyncio.TaskGroup() as parts:
+            for part in (self._autopilot_link, self._link, self.exchange):
+                parts.create_task(part.run())
+
+    def close(self) -> None:
+        self._log.close()
+
+    async def see(self, frame: Frame) -> None:
+        """Have the drone take a frame, when its autopilot has measured at that instant."""
+        self._clock.advance_to(frame.captured_at_ns)
+        taken = demo.shot(self.system_id).ned_from_body
+        self.autopilot.measure(frame.captured_at_ns, taken.quaternion())
+        assert await self._autopilot_link.attitude_at(frame.captured_at_ns, 5.0) is not None
+        self.exchange.on_frame(frame)
+
+    @property
+    def revision(self) -> bytes:
+        """Of the map it flies on; empty without one."""
+        return b"" if self.maps.current is None else self.maps.current.revision
+
+    def lines(self, kind: str) -> list[dict[str, Any]]:
+        """What its log says of one kind so far."""
+        records = map(json.loads, self._log_path.read_text().splitlines())
+        return [record for record in records if record["kind"] == kind]
+
+    def events(self, event: str) -> list[str]:
+        """The reasons of the events of one name so far."""
+        return [line["reason"] for line in self.lines("event") if line["event"] == event]
+
+    def _hear(self, tunnel: Tunnel) -> None:
+        if tunnel.payload_type == MESSAGE and tunnel.payload[1:2] == b"\x03":
+            with contextlib.suppress(Exception):
+                message = decode_payload(tunnel.payload_type, tunnel.payload)
+                assert isinstance(message, FrameRequest)
+                self.requests.append(message)
+        self.exchange.on_tunnel(tunnel)
+
+
+class Stranger:
+    """A member of the swarm that says what a test wants it to."""
+
+    def __init__(self, system_id: int, members: tuple[int, ...], peers: PeerOptions) -> None:
+        self._link = PeerLink(peers, system_id, frozenset(members), self._hear, lambda _: None)
+        self.forget()
+        self.messages: asyncio.Queue[FrameRequest | MapState | MapRefused] = asyncio.Queue()
+        self.blobs: asyncio.Queue[BlobReceived] = asyncio.Queue()
+        self._heard: set[int] = set()
+
+    def forget(self) -> None:
+        """Remember no transfer, like one that has just been started."""
+        self._transfers = Transfers(FAST, np.random.default_rng(0))
+
+    async def run(self) -> None:
+        async with asyncio.TaskGroup() as parts:
+            parts.create_task(self._link.run())
+            parts.create_task(self._pump())
+
+    async def meets(self, *system_ids: int) -> None:
+        """Wait until these have been heard, so that what is said to them arrives."""
+        await until(lambda: self._heard.issuperset(system_ids))
+
+    def say(self, message: FrameRequest | MapState | MapRefused, to: int) -> None:
+        self._link.send(*encode_payload(message), to)
+
+    def say_bytes(self, payload_type: int, payload: bytes, to: int) -> None:
+        self._link.send(payload_type, payload, to)
+
+    def hand(self, kind: BlobKind, blob: bytes, to: int) -> None:
+        """Send a blob."""
+        self._transfers.submit(to, kind, blob, asyncio.get_running_loop().time())
+
+    def heard(self) -> list[FrameRequest | MapState | MapRefused]:
+        """Take the messages that have come so far."""
+        return [self.messages.get_nowait() for _ in range(self.messages.qsize())]
+
+    async def asked(self) -> FrameRequest:
+        """Wait for the next request for a frame."""
+        while True:
+            message = await self.messages.get()
+            if isinstance(message, FrameRequest):
+                return message
+
+    async def answer(self) -> tuple[bytes, FrameAnswer]:
+        """Wait for the next frame, as bytes and read."""
+        received = await self.blobs.get()
+        assert received.kind == BlobKind.FRAME_ANSWER
+        return received.blob, decode_frame(received.blob)
+
+    def _hear(self, tunnel: Tunnel) -> None:
+        self._heard.add(tunnel.sender_system)
+        message = decode_payload(tunnel.payload_type, tunnel.payload)
+        if not isinstance(message, Chunk | TransferStatus):
+            self.messages.put_nowait(message)
+            return
+        now_s = asyncio.get_running_loop().time()
+        self._take(self._transfers.receive(tunnel.sender_system, message, now_s))
+
+    async def _pump(self) -> None:
+        while True:
+            outgoing, events = self._transfers.poll(asyncio.get_running_loop().time())
+            self._take(events)
+            for payload in outgoing:
+                self._link.send(payload.payload_type, payload.payload, payload.peer)
+            await asyncio.sleep(0.002)
+
+    def _take(self, events: list[Event]) -> None:
+        for event in events:
+            if isinstance(event, BlobReceived):
+                self.blobs.put_nowait(event)
+
+
+class Swarm:
+    """Starts and stops the members of one swarm."""
+
+    def __init__(self, members: tuple[int, ...], path: Path, stack: contextlib.AsyncExitStack):
+        self._members = members
+        self._path = path
+        self._stack = stack
+        ports = free_ports(len(members))
+        self._addresses = {m: f"127.0.0.1:{p}" for m, p in zip(members, ports, strict=True)}
+        self._n_started = 0
+        self._lives: dict[int, contextlib.AsyncExitStack] = {}
+
+    async def start(
+        self,
+        system_id: int,
+        flies_on: tuple[int, ...] = (),
+        transfer: TransferOptions = FAST,
+        runs: bool = True,
+    ) -> Drone:
+        """Start a drone at the instant of its first frame, flying on the map of some if given."""
+        life = await self._stack.enter_async_context(contextlib.AsyncExitStack())
+        self._lives[system_id] = life
+        self._n_started += 1
+        shot = demo.shot(system_id)
+        clock = ManualClock(shot.at_ns)
+        executor = life.enter_context(ThreadPoolExecutor(1))
+        quaternion = shot.ned_from_body.quaternion()
+        autopilot = await life.enter_async_context(
+            autopilot_and_link(system_id, clock, shot.at_ns, quaternion)
+        )
+        log_path = self._path / f"{system_id}-{self._n_started}.jsonl"
+        drone = Drone(
+            system_id, self._members, self._peers(system_id), autopilot, clock, executor,
+            log_path, transfer, self._n_started,
+        )  # fmt: skip
+        life.callback(drone.close)
+        if flies_on:
+            drone.maps.replace(demo.encoded_map(*flies_on), demo.map_index(*flies_on))
+        if runs:
+            await life.enter_async_context(beside(drone.run()))
+            await drone.autopilot.states.get()
+        return drone
+
+    async def stop(self, drone: Drone) -> None:
+        """End a drone."""
+        await self._lives[drone.system_id].aclose()
+
+    async def stranger(self, system_id: int) -> Stranger:
+        """Start a member that is played by the test."""
+        stranger = Stranger(system_id, self._members, self._peers(system_id))
+        await self._stack.enter_async_context(beside(stranger.run()))
+        return stranger
+
+    def _peers(self, system_id: int) -> PeerOptions:
+        others = tuple(a for m, a in self._addresses.items() if m != system_id)
+        return PeerOptions(self._addresses[system_id], others)
+
+
+@contextlib.asynccontextmanager
+async def swarm(*members: int, path: Path) -> AsyncIterator[Swarm]:
+    """A swarm whose members are started by the test, and ended behind it."""
+    async with contextlib.AsyncExitStack() as stack:
+        yield Swarm(members, path, stack)
+
+
+def tunnel(sender: int, payload_type: int, payload: bytes) -> Tunnel:
+    """What a link hands over of a payload to everybody."""
+    return Tunnel(sender, COMPANION, 0, payload_type, payload)
+
+
+def said(sender: int, message: FrameRequest | MapState | MapRefused) -> Tunnel:
+    """What a link hands over of a message to everybody."""
+    payload_type, payload = encode_payload(message)
+    return tunnel(sender, payload_type, payload)

@@ -1,0 +1,289 @@
+"""From frame to pose over the simulator's stream: every frame is answered once, and in time."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections import Counter
+from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sitl.frame_server import FrameServer
+from tests.daemon import demo
+from tests.daemon.autopilot import Autopilot, autopilot_and_link
+from tests.daemon.waiting import beside, run, until
+from vcl_companion.cameras.stream import StreamCamera
+from vcl_companion.clock import ManualClock
+from vcl_companion.daemon.companion import Companion, CompanionOptions
+from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.frame_history import FrameHistory
+from vcl_companion.daemon.health import Health
+from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.localization.intra import LocalizationOptions
+from vcl_companion.localization.pose_filter import FilterOptions
+
+DRONE = 2
+OPTIONS = CompanionOptions(demo.FEATURES, LocalizationOptions(), FilterOptions())
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """One drone's line from camera to autopilot, its camera and its autopilot."""
+
+    companion: Companion
+    server: FrameServer
+    autopilot: Autopilot
+    link: AutopilotLink
+    maps: MapStore
+    history: FrameHistory
+    log: FlightLog
+    path: Path
+
+    def give(self, k: int, sequence: int | None = None) -> None:
+        """Hand out the k-th picture, and its attitude before it."""
+        shot = demo.shot(DRONE, k)
+        self.autopilot.measure(shot.at_ns, shot.ned_from_body.quaternion())
+        self.server.give(k if sequence is None else sequence, shot.at_ns, demo.png(shot.image))
+
+    def fly_on_a_map(self) -> None:
+        self.maps.replace(demo.encoded_map(1, 2, 3), demo.map_index(1, 2, 3))
+
+    def end_stream(self, k: int) -> None:
+        self.server.say_end(demo.shot(DRONE, k).at_ns)
+
+    def frames(self) -> list[tuple[int, str, str | None]]:
+        """Sequence, outcome and reason of every line of a frame."""
+        lines: list[dict[str, Any]] = list(map(json.loads, self.path.read_text().splitlines()))
+        return [
+            (line["sequence"], line["outcome"], line["reason"])
+            for line in lines
+            if line["kind"] == "frame"
+        ]
+
+
+@contextlib.asynccontextmanager
+async def flight(path: Path) -> AsyncIterator[Flight]:
+    """A companion with everything around it; its own two coroutines do not run yet."""
+    first = demo.shot(DRONE)
+    clock = ManualClock(first.at_ns)
+    async with contextlib.AsyncExitStack() as stack:
+        server = FrameServer("mav1")
+        port = await server.start()
+        stack.push_async_callback(server.close)
+        sensor = demo.sensor(DRONE)
+        size_px = (sensor.camera.width_px, sensor.camera.height_px)
+        camera = StreamCamera("127.0.0.1", port, size_px, clock)
+        stack.push_async_callback(camera.close)
+        autopilot, link = await stack.enter_async_context(
+            autopilot_and_link(DRONE, clock, first.at_ns, first.ned_from_body.quaternion())
+        )
+        log = stack.enter_context(contextlib.closing(FlightLog(str(path / "log"), clock)))
+        executor = stack.enter_context(ThreadPoolExecutor(1))
+        maps, history = MapStore(""), FrameHistory()
+        companion = Companion(
+            camera, sensor, clock, link, maps, history.add, Health(link, log), log, executor,
+            OPTIONS,
+        )  # fmt: skip
+        await stack.enter_async_context(beside(link.run()))
+        assert await link.attitude_at(first.at_ns, 5.0) is not None
+        yield Flight(companion, server, autopilot, link, maps, history, log, path / "log")
+
+
+@contextlib.asynccontextmanager
+async def flying(path: Path) -> AsyncIterator[Flight]:
+    """The same, in flight."""
+    async with flight(path) as up, beside(up.companion.read_camera(), up.companion.run()):
+        await up.server.connected()
+        yield up
+
+
+def test_frames_become_poses_near_the_truth(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            assert not up.companion.is_localized
+            for k in range(3):
+                up.give(k)
+                await up.server.answered()
+                pose = await up.autopilot.poses.get()
+                usec, sent = pose[0], np.array(pose[1:4])
+                assert usec == demo.shot(DRONE, k).at_ns // 1000
+                error_m = np.linalg.norm(sent - demo.world_from_body(DRONE, k).translation)
+                assert 1e-5 < error_m < 0.15
+                assert pose[-1] == 0  # reset_counter
+            assert up.companion.is_localized
+            assert set(up.server.outcomes.values()) == {"localized"}
+            assert up.frames() == [(k, "localized", None) for k in range(3)]
+            newest = up.history.newest
+            assert newest is not None
+            assert newest.sequence == 2
+
+    run(scenario())
+
+
+def test_a_frame_waits_for_the_first_map_and_is_then_localized(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.give(0)
+            assert await up.autopilot.texts.get() == "VCL waiting for a map"
+            assert up.server.outcomes == {}
+            up.fly_on_a_map()
+            await up.server.answered()
+            assert up.server.outcomes == {0: "localized"}
+            assert up.frames() == [(0, "localized", None)]
+
+    run(scenario())
+
+
+def test_a_newer_frame_takes_the_place_of_the_one_that_waits(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            for k in range(4):
+                up.give(k)
+            await until(lambda: len(up.server.outcomes) == 3)
+            assert up.server.outcomes == {0: "refused", 1: "refused", 2: "refused"}
+            up.fly_on_a_map()
+            await up.server.answered()
+            assert up.server.outcomes[3] == "localized"
+            assert sorted(up.frames()) == [
+                *((k, "refused", "no map: none yet") for k in range(3)),
+                (3, "localized", None),
+            ]
+
+    run(scenario())
+
+
+def test_a_refused_map_answers_the_frame_with_its_reason(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.give(0)
+            assert await up.autopilot.texts.get() == "VCL waiting for a map"
+            up.maps.refuse("fog")
+            await up.server.answered()
+            up.give(1)
+            await until(lambda: up.history.newest is not None and up.history.newest.sequence == 1)
+            assert up.frames() == [(0, "refused", "no map: fog")]
+            up.fly_on_a_map()
+            await up.server.answered()
+            assert up.server.outcomes == {0: "refused", 1: "localized"}
+
+    run(scenario())
+
+
+def test_the_end_of_the_stream_answers_all_that_waits(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        for n_frames in (0, 1, 3):
+            async with flight(tmp_path) as up, beside(up.companion.run()):
+                reading = asyncio.create_task(up.companion.read_camera())
+                await up.server.connected()
+                for k in range(n_frames):
+                    up.give(k)
+                up.end_stream(max(n_frames - 1, 0))
+                began_s = asyncio.get_running_loop().time()
+                await reading
+                assert asyncio.get_running_loop().time() - began_s < 3.0
+                await up.server.answered()
+                assert [outcome for _, outcome, _ in up.frames()] == ["refused"] * n_frames
+                if n_frames:
+                    assert up.frames()[-1][2] == "no map: the camera's stream is over"
+
+    run(scenario())
+
+
+def test_the_end_of_the_stream_leaves_time_for_the_last_frame(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flight(tmp_path) as up, beside(up.companion.run()):
+            up.fly_on_a_map()
+            reading = asyncio.create_task(up.companion.read_camera())
+            await up.server.connected()
+            up.give(0)
+            up.end_stream(0)
+            await reading
+            assert up.frames() == [(0, "localized", None)]
+
+    run(scenario())
+
+
+def test_frames_faster_than_they_can_be_localized_are_dropped_and_counted(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            for k in range(8):
+                up.give(k)
+            await up.server.answered()
+            counts = Counter(up.server.outcomes.values())
+            assert sum(counts.values()) == 8
+            assert 1 <= counts["localized"] <= 7
+            assert counts["dropped"] == 8 - counts["localized"]
+            assert up.server.outcomes[7] == "localized"  # fresh beats complete
+            assert up.log.frames == {"refused": 0, **counts}
+            assert sorted(sequence for sequence, _, _ in up.frames()) == list(range(8))
+
+    run(scenario())
+
+
+def test_frames_that_never_reached_us_are_counted(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            up.server.n_given = 10  # it numbers them with a gap
+            up.give(0, sequence=3)
+            await until(lambda: 3 in up.server.outcomes)
+            up.give(1, sequence=7)
+            await until(lambda: 7 in up.server.outcomes)
+            assert up.log.frames == {"localized": 2, "refused": 0, "dropped": 3}
+
+    run(scenario())
+
+
+def test_a_picture_without_anything_in_it_is_refused_with_a_reason(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            up.server.give(0, demo.shot(DRONE).at_ns, demo.png(demo.blank(DRONE)))
+            await up.server.answered()
+            ((sequence, outcome, reason),) = up.frames()
+            assert (sequence, outcome) == (0, "refused")
+            assert reason
+            assert up.autopilot.poses.empty()
+            assert not up.companion.is_localized
+            assert (await up.autopilot.texts.get()) == f"VCL waiting: {reason}"
+
+    run(scenario())
+
+
+def test_a_fix_of_long_ago_is_no_place_any_more(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            up.give(0)
+            await up.server.answered()
+            assert up.companion.is_localized
+            up.server.tell_time(demo.shot(DRONE).at_ns + 2_100_000_000)
+            await until(lambda: not up.companion.is_localized)
+
+    run(scenario())
+
+
+def test_what_is_open_when_the_service_ends_is_answered_then(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flight(tmp_path) as up:
+            async with beside(up.companion.read_camera(), up.companion.run()):
+                await up.server.connected()
+                up.give(0)
+                assert await up.autopilot.texts.get() == "VCL waiting for a map"
+            assert up.frames() == []
+            up.companion.end()
+            await up.server.answered()
+            assert up.frames() == [(0, "refused", "the service has ended")]
+            up.companion.end()
+            assert len(up.frames()) == 1
+
+    run(scenario())

@@ -1,0 +1,123 @@
+"""The flight log: its lines as the report reads them, its counts, and a disk that is full."""
+
+from __future__ import annotations
+
+import gc
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sitl.flight_log import read_flight_log
+from vcl_companion.clock import ManualClock
+from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.errors import ConfigError
+
+SUMMARY = {
+    "cpu_s": 1.5,
+    "wall_s": 3.0,
+    "resident_mb": 99.0,
+    "peer_bytes_sent": 7,
+    "peer_bytes_received": 8,
+}
+
+
+def fill(log: FlightLog) -> None:
+    log.frame(0, 100, "localized", latency_ms=12.5, matched=40, inliers=30)
+    log.frame(1, 200, "refused", reason="fog", latency_ms=8.0, matched=3)
+    log.frame(2, 300, "dropped")
+    log.frame(3, 400, "refused", reason="fog", latency_ms=9.0)
+    log.missed(2)
+
+
+def lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def test_lines_are_as_specified(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "flight.jsonl"
+    clock = ManualClock(41)
+    log = FlightLog(str(path), clock)
+    fill(log)
+    clock.advance_to(42)
+    log.event("lost", "fog \u2601")
+    log.map(bytes(range(8)), 120, 4567, 3)
+    before_the_end = lines(path)
+    log.close(**SUMMARY)
+    assert lines(path)[:-1] == before_the_end == [
+        {"kind": "frame", "sequence": 0, "captured_at_ns": 100, "outcome": "localized",
+         "reason": None, "latency_ms": 12.5, "matched": 40, "inliers": 30},
+        {"kind": "frame", "sequence": 1, "captured_at_ns": 200, "outcome": "refused",
+         "reason": "fog", "latency_ms": 8.0, "matched": 3, "inliers": 0},
+        {"kind": "frame", "sequence": 2, "captured_at_ns": 300, "outcome": "dropped",
+         "reason": None, "latency_ms": None, "matched": 0, "inliers": 0},
+        {"kind": "frame", "sequence": 3, "captured_at_ns": 400, "outcome": "refused",
+         "reason": "fog", "latency_ms": 9.0, "matched": 0, "inliers": 0},
+        {"kind": "event", "at_ns": 42, "event": "lost", "reason": "fog \u2601"},
+        {"kind": "map", "at_ns": 42, "revision": "0001020304050607", "landmarks": 120,
+         "bytes": 4567, "keyframes": 3},
+    ]  # fmt: skip
+    assert lines(path)[-1] == {
+        "kind": "summary",
+        "frames": {"localized": 1, "refused": 2, "dropped": 3},
+        "refusals": {"fog": 2},
+        **SUMMARY,
+    }
+
+
+def test_the_report_reads_it(tmp_path: Path) -> None:
+    path = tmp_path / "flight.jsonl"
+    log = FlightLog(str(path), ManualClock())
+    fill(log)
+    log.close(**SUMMARY)
+    read = read_flight_log(path)
+    assert len(read.frames) == 4
+    assert read.summary is not None
+    assert read.summary.refusals == {"fog": 2}
+
+
+def test_an_earlier_flight_is_replaced_and_nothing_follows_the_summary(tmp_path: Path) -> None:
+    path = tmp_path / "flight.jsonl"
+    path.write_text("an earlier flight")
+    log = FlightLog(str(path), ManualClock())
+    log.close(**SUMMARY)
+    log.event("late", "a thread that ends after us")
+    log.close(**SUMMARY)
+    assert [line["kind"] for line in lines(path)] == ["summary"]
+
+
+def test_without_a_file_it_still_counts() -> None:
+    log = FlightLog("", ManualClock())
+    fill(log)
+    log.close(**SUMMARY)
+    assert log.frames == {"localized": 1, "refused": 2, "dropped": 3}
+    assert log.refusals == {"fog": 2}
+
+
+def test_reasons_without_end_do_not_grow_it() -> None:
+    log = FlightLog("", ManualClock())
+    for k in range(1000):
+        log.frame(k, k, "refused", reason=f"{k} landmarks agree")
+    log.frame(1000, 1000, "refused", reason="0 landmarks agree")
+    assert sum(log.refusals.values()) == log.frames["refused"] == 1001
+    assert 100 <= len(log.refusals) <= 300
+    assert log.refusals["0 landmarks agree"] == 2
+    assert log.refusals["other reasons"] > 700
+
+
+def test_a_full_disk_ends_the_log_but_not_the_flight(caplog: pytest.LogCaptureFixture) -> None:
+    log = FlightLog("/dev/full", ManualClock())
+    fill(log)
+    log.close(**SUMMARY)
+    assert log.frames["refused"] == 2
+    assert caplog.text.count("No space left on device") == 1
+    del log
+    gc.collect()  # a file that is still open would complain now
+
+
+@pytest.mark.parametrize("path", ["/proc/flight.jsonl", "/dev/null/flight.jsonl", "/tmp", "a\0b"])
+def test_a_file_that_cannot_be_written_is_a_wrong_configuration(path: str) -> None:
+    with pytest.raises(ConfigError, match=r"^\[log\] flight_log '.*': \w") as raised:
+        FlightLog(path, ManualClock())
+    assert "\n" not in str(raised.value)

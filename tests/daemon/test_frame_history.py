@@ -1,0 +1,63 @@
+"""The frames that peers may still ask for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vcl_companion.cameras.source import Frame
+from vcl_companion.daemon.frame_history import FrameHistory
+
+MS = 1_000_000
+
+
+def frame(at_ms: int) -> Frame:
+    return Frame(np.zeros((2, 3), np.uint8), at_ms * MS, 0, 0)
+
+
+def nearest_ms(history: FrameHistory, at_ms: int) -> int | None:
+    found = history.nearest(at_ms * MS)
+    return None if found is None else found.captured_at_ns // MS
+
+
+def test_without_frames_there_is_none() -> None:
+    assert FrameHistory().newest is None
+    assert FrameHistory().nearest(0) is None
+
+
+def test_the_nearest_is_found_before_between_and_after() -> None:
+    history = FrameHistory()
+    for at_ms in (1000, 1200, 1400):
+        history.add(frame(at_ms))
+    asked = (500, 1000, 1099, 1101, 1390, 2000)
+    assert [nearest_ms(history, at_ms) for at_ms in asked] == [1000, 1000, 1000, 1200, 1400, 1400]
+
+
+def test_a_frame_of_another_moment_is_none() -> None:
+    history = FrameHistory()
+    history.add(frame(5000))
+    assert [nearest_ms(history, at_ms) for at_ms in (3999, 4000, 6000, 6001)] == [
+        None, 5000, 5000, None,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("rate_hz", [5, 30, 120])
+def test_what_was_asked_for_a_second_ago_is_still_here(rate_hz: int) -> None:
+    history = FrameHistory()
+    period_ms = 1000 / rate_hz
+    for k in range(10 * rate_hz):
+        history.add(frame(round(k * period_ms)))
+    now_ms = round((10 * rate_hz - 1) * period_ms)
+    assert nearest_ms(history, now_ms) == now_ms
+    for ago_ms in range(0, 1900, 37):
+        found_ms = nearest_ms(history, now_ms - ago_ms)
+        assert found_ms is not None
+        assert abs(now_ms - ago_ms - found_ms) <= max(period_ms / 2 + 1, 60)
+
+
+def test_it_does_not_grow() -> None:
+    history = FrameHistory()
+    for k in range(1000):
+        history.add(frame(100 * k))
+    oldest = [at_ms for at_ms in range(0, 100_000, 100) if nearest_ms(history, at_ms) == at_ms]
+    assert 20 <= len(oldest) <= 30
