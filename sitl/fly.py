@@ -128,6 +128,9 @@ async def _play(plan: FlightPlan, swarm: Swarm, conduct: Conduct, progress: Prog
             await _all_answered(swarm)
         await asyncio.sleep(max(0.0, pace.wait_s(moment.at_ns, time.monotonic())))
         await _hand_out(moment, swarm)
+        if k == 0:
+            await swarm.clocks_related(moment.at_ns)
+            pace = Pace(speed, moment.at_ns, time.monotonic())
         n_given += len(moment.frames)
         if not flat_out and k > holds_after:
             late_s = -pace.wait_s(moment.at_ns, time.monotonic())

@@ -35,12 +35,18 @@ class StandIn:
             raise FlightError(f"{child.name} does not say its port")
         return cls(child, port)
 
-    async def advance_to(self, at_ns: int) -> None:
-        """Have it send what is due until an instant, and wait until it has."""
+    async def advance_to(self, at_ns: int) -> int:
+        """Have it send what is due until an instant, and wait until it has.
+
+        Returns:
+            How many of its daemon's questions for the time it has answered so far.
+        """
         await _say(self.child, {"advance_to_ns": at_ns})
         answer = await _reply(self.child)
-        if answer.get("at_ns") != at_ns:
+        told = answer.get("times_told")
+        if answer.get("at_ns") != at_ns or not isinstance(told, int):
             raise FlightError(f"{self.child.name} was told {at_ns} ns and answers {answer}")
+        return told
 
     async def finish(self) -> None:
         """Have it write down everything it heard, and end.

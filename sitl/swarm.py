@@ -6,6 +6,7 @@ import asyncio
 import os
 import socket
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,10 @@ from sitl.processes import Child, FlightError, end_children, start_child, unless
 from sitl.stand_in_process import StandIn, start_stand_in
 
 _END_TIMEOUT_S = 10.0
+# A daemon asks ten times a second until it has enough answers.
+_CLOCKS_TIMEOUT_S = 5.0
+_N_EXCHANGES = 4
+_LOOK_S = 0.02
 _FROM_SYSTEMD = ("JOURNAL_STREAM", "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
 # One core per drone at most: a companion board has few, and results must not hang on their number.
 _ONE_THREAD = dict.fromkeys(
@@ -96,6 +101,20 @@ class Swarm:
     async def advance_to(self, at_ns: int) -> None:
         """Move every autopilot's time on."""
         await asyncio.gather(*(drone.stand_in.advance_to(at_ns) for drone in self.drones))
+
+    async def clocks_related(self, at_ns: int) -> None:
+        """Hold the time at an instant until every daemon knows its autopilot's clock.
+
+        A question that is on its way while time steps on is answered too late,
+        and the attitude of the first frames would depend on it. Not for ever:
+        what a daemon makes of silence is its own matter.
+        """
+        deadline_s = time.monotonic() + _CLOCKS_TIMEOUT_S
+        while time.monotonic() < deadline_s:
+            told = [await drone.stand_in.advance_to(at_ns) for drone in self.drones]
+            if min(told) >= _N_EXCHANGES:
+                return
+            await asyncio.sleep(_LOOK_S)
 
     async def finish(self) -> None:
         """End the daemons, then the stand-ins, in order: every log gets its last line.

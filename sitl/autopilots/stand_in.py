@@ -5,7 +5,9 @@ everything it hears. Its time is a recording's, moved on by JSON lines:
 
     stdout {"port": P}              ready; the companion sends to 127.0.0.1:P
     stdin  {"advance_to_ns": t}     send what is due up to t
-    stdout {"at_ns": t}             all of it has been handed to the kernel
+    stdout {"at_ns": t, "times_told": n}
+                                    all of it has been handed to the kernel; n
+                                    TIMESYNC questions answered so far
     stdin  {"finish": true}         write what was heard and end
 
 The end of stdin ends it as well. Only heartbeats go by the wall clock, since
@@ -115,6 +117,7 @@ class StandIn:
         self._companion: tuple[str, int] | None = None
         self._backlog: deque[tuple[int, bytes]] = deque()
         self._next_heartbeat_s = 0.0
+        self.n_times_told = 0
 
     def advance_to(self, until_ns: int) -> int:
         """Send what is due up to an instant of the recording; return the time it is then."""
@@ -197,6 +200,7 @@ class StandIn:
     def _answer(self, message: Any, kind: str) -> None:
         if kind == "TIMESYNC" and message.tc1 == 0 and self._now_ns is not None:
             self._send(dialect.MAVLink_timesync_message(max(1, self._boot_ns()), message.ts1))
+            self.n_times_told += 1
         elif kind == "COMMAND_LONG" and message.target_system == self._options.system_id:
             known = message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL
             self._send(
@@ -251,7 +255,8 @@ def obey(stand_in: StandIn, command: Mapping[str, object]) -> dict[str, int] | N
     """
     match command:
         case {"advance_to_ns": int(at_ns)}:
-            return {"at_ns": stand_in.advance_to(at_ns)}
+            now_ns = stand_in.advance_to(at_ns)
+            return {"at_ns": now_ns, "times_told": stand_in.n_times_told}
         case {"finish": True}:
             return None
     raise ConfigError(f"control: unknown command {json.dumps(command)}")
