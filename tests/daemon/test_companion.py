@@ -25,6 +25,7 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.geometry.rotation import matrix_from_euler, quaternion_from_matrix
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.localization.intra import LocalizationOptions
 from vcl_companion.localization.pose_filter import FilterOptions
@@ -46,10 +47,11 @@ class Flight:
     log: FlightLog
     path: Path
 
-    def give(self, k: int, sequence: int | None = None) -> None:
+    def give(self, k: int, sequence: int | None = None, north_turned_rad: float = 0.0) -> None:
         """Hand out the k-th picture, and its attitude before it."""
         shot = demo.shot(DRONE, k)
-        self.autopilot.measure(shot.at_ns, shot.ned_from_body.quaternion())
+        turned = matrix_from_euler(0.0, 0.0, north_turned_rad) @ shot.ned_from_body.rotation
+        self.autopilot.measure(shot.at_ns, quaternion_from_matrix(turned))
         self.server.give(k if sequence is None else sequence, shot.at_ns, demo.png(shot.image))
 
     def fly_on_a_map(self) -> None:
@@ -255,6 +257,22 @@ def test_a_picture_without_anything_in_it_is_refused_with_a_reason(tmp_path: Pat
             assert up.autopilot.poses.empty()
             assert not up.companion.is_localized
             assert (await up.autopilot.texts.get()) == f"VCL waiting: {reason}"
+
+    run(scenario())
+
+
+def test_an_autopilot_that_turns_its_north_is_followed_after_a_few_frames(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            for k in range(8):
+                up.give(k, north_turned_rad=0.0 if k < 2 else np.deg2rad(12.0))
+                await up.server.answered()
+            outcomes = [outcome for _, outcome, _ in up.frames()]
+            assert outcomes == ["localized"] * 2 + ["refused"] * 4 + ["localized"] * 2
+            assert "against the autopilot's attitude" in str(up.frames()[2][2])
+            resets = [(await up.autopilot.poses.get())[-1] for _ in range(4)]
+            assert resets == [0, 0, 1, 1]
 
     run(scenario())
 

@@ -38,6 +38,8 @@ _log = logging.getLogger(__name__)
 
 # How long an attitude sample may still be on its way when its frame is here.
 ATTITUDE_WAIT_S = 0.1
+# So many fixes in a row that contradict the state are right, and the state is wrong.
+_MAX_CONTRADICTED = 5
 # How long the last frames of a stream may take.
 _LAST_FRAMES_S = 5.0
 # A fix this old is no more where we are.
@@ -95,6 +97,7 @@ class Companion:
         self._mailbox = Mailbox()
         self._state: FilterState | None = None
         self._n_resets = 0
+        self._n_contradicted = 0
         self._last_sequence: int | None = None
         self._open: list[Frame] = []
         self._over = asyncio.Event()
@@ -205,9 +208,17 @@ class Companion:
     ) -> FilterState | NotLocalized:
         if predicted is not None:
             state = update(predicted, fix)
-            if isinstance(state, FilterState) and state.n_jumps > predicted.n_jumps:
-                self._jumped(fix)
-            return state
+            if isinstance(state, FilterState):
+                self._n_contradicted = 0
+                if state.n_jumps > predicted.n_jumps:
+                    self._jumped(fix)
+                return state
+            # One fix against the state is wrong; several in a row say that the state
+            # is, or that the autopilot has turned its north.
+            self._n_contradicted += 1
+            if self._n_contradicted < _MAX_CONTRADICTED:
+                return state
+            self._n_contradicted = 0
         if self._state is not None:
             self._jumped(fix)
         return started(fix, frame.captured_at_ns, ned_from_body, self._options.filter)
