@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import msgspec
 import numpy as np
 
-from sitl import details
+from sitl import details, roofs
 from sitl.faces import Face, Frame, Side, box, reveals
 from sitl.textures import Canvas, Style, material
+
+RichSide = Literal["left", "right", "back"]
 
 
 class Building(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -22,6 +26,12 @@ class Building(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         bays: boxes of a storey or more that stand out of the front.
         relief: scales everything that stands out of or into the front; 0 is a flat wall.
         detail: scales the number of signs, posters, graffiti, fixtures.
+        alike: share of windows that look alike, and how evenly they stand: 0 makes each
+            its own, 1 a block of flats.
+        rich_sides: walls that are built like the front, as seen from before it; the
+            others are flat and painted.
+        roof: ``gable`` is tiled, its ridge along the front, with stepped gables.
+        roof_deg: how steep a gable roof is.
         seed: buildings with equal seed and size look the same; 0 makes each its own.
     """
 
@@ -37,6 +47,10 @@ class Building(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bays: int = 1
     relief: float = 1.0
     detail: float = 1.0
+    alike: float = 0.0
+    rich_sides: tuple[RichSide, ...] = ()
+    roof: Literal["flat", "gable"] = "flat"
+    roof_deg: float = 42.0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -44,25 +58,37 @@ class Building(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("building: width_m, depth_m and height_m are 2 m or more")
         if min(self.columns, self.floors, self.bays) < 0 or min(self.relief, self.detail) < 0.0:
             raise ValueError("building: columns, floors, bays, relief, detail are not negative")
+        if not 0.0 <= self.alike <= 1.0 or not 5.0 <= self.roof_deg <= 70.0:
+            raise ValueError("building: alike is 0 to 1, roof_deg is 5 to 70")
 
 
 class _Site:
-    """The building while it grows: its grid of windows, its faces, its generator."""
+    """A wall while it grows: its grid of windows, its faces, its generator."""
 
-    def __init__(self, building: Building, rng: np.random.Generator, texels_per_m: float) -> None:
+    def __init__(
+        self,
+        building: Building,
+        front: Frame,
+        width_m: float,
+        rng: np.random.Generator,
+        texels_per_m: float,
+    ) -> None:
         self.building, self.rng, self.tpm = building, rng, texels_per_m
-        self.width, self.height = building.width_m, building.height_m
-        foot = np.array([building.x_m, building.y_m, 0.0])
-        facing = np.deg2rad(building.facing_deg)
-        self.front = Frame.facing(foot, facing, self.width, self.height)
+        self.width, self.height = width_m, building.height_m
+        self.front = front
         self.faces: list[Face] = []
-        columns = building.columns or max(1, round(self.width / 2.7))
+        own_columns = building.columns if width_m == building.width_m else 0
+        columns = own_columns or max(1, round(self.width / 2.7))
         floors = building.floors or max(1, round((self.height - 1.2) / 3.2))
         self.cell_m = self.width / columns
         self.storey_m = (self.height - 1.2) / floors
         middles = (np.arange(columns) + 0.5) * self.cell_m
         middles = middles + rng.uniform(-0.12, 0.12, columns) * self.cell_m
         halves = 0.5 * self.cell_m * rng.uniform(0.4, 0.62, columns)
+        if building.alike > 0.0:
+            even = (np.arange(columns) + 0.5) * self.cell_m
+            middles = even + (1.0 - building.alike) * (middles - even)
+            halves = halves[0] + (1.0 - building.alike) * (halves - halves[0])
         self.columns = np.stack([middles - halves, middles + halves], axis=1)
         tops = (
             1.2 + np.arange(floors) * self.storey_m + self.storey_m * rng.uniform(0.1, 0.2, floors)
@@ -71,6 +97,13 @@ class _Site:
         heights[-1] = 0.7 * self.storey_m  # shop windows
         self.rows = np.stack([tops, tops + heights], axis=1)
         self.free = rng.random((floors, columns)) < 0.9
+        self.common_look = int(rng.integers(2**31)) if building.alike > 0.0 else 0
+
+    def window_rng(self) -> np.random.Generator:
+        """Return what the next window is drawn from: the same for all that look alike."""
+        if self.building.alike > 0.0 and self.rng.random() < self.building.alike:
+            return np.random.default_rng(self.common_look)
+        return self.rng
 
     def paint(self, side: Side, width_m: float, height_m: float) -> Canvas:
         """Paint a part with the building's own material."""
@@ -98,20 +131,41 @@ def build(building: Building, rng: np.random.Generator, texels_per_m: float) -> 
         rng: where its looks are drawn from.
         texels_per_m: resolution of its paint.
     """
-    site = _Site(building, rng, texels_per_m)
-    if building.relief > 0.0:
+    foot = np.array([building.x_m, building.y_m, 0.0])
+    facing = np.deg2rad(building.facing_deg)
+    front = Frame.facing(foot, facing, building.width_m, building.height_m)
+    site = _Site(building, front, building.width_m, rng, texels_per_m)
+    _rich_wall(site)
+    _shell(site)
+    across, inward, depth = front.right, front.inward, building.depth_m
+    walls: dict[RichSide, tuple[Frame, float]] = {
+        "left": (Frame(front.point(0.0, 0.0, -depth), -inward, front.down), depth),
+        "right": (Frame(front.point(building.width_m, 0.0), inward, front.down), depth),
+        "back": (
+            Frame(front.point(building.width_m, 0.0, -depth), -across, front.down),
+            building.width_m,
+        ),
+    }
+    for side in building.rich_sides:
+        beside = _Site(building, *walls[side], rng, texels_per_m)
+        _rich_wall(beside)
+        site.faces += beside.faces
+    return site.faces
+
+
+def _rich_wall(site: _Site) -> None:
+    """Build a wall with everything that stands out of it and into it."""
+    if site.building.relief > 0.0:
         _bays(site)
     _wall(site)
-    if building.relief > 0.0:
+    if site.building.relief > 0.0:
         _ledges(site)
         _fixtures(site)
-    _shell(site)
-    return site.faces
 
 
 def _wall(site: _Site) -> None:
     """Build the front with its openings, the glass behind them, and what is painted on it."""
-    rng, tpm, relief = site.rng, site.tpm, site.building.relief
+    tpm, relief = site.tpm, site.building.relief
     canvas = site.paint("front", site.width, site.height)
     _decorate(site, canvas)
     openings = []
@@ -120,7 +174,8 @@ def _wall(site: _Site) -> None:
     for floor, (top, bottom) in enumerate(site.rows.tolist()):
         for column, (left, right) in enumerate(site.columns.tolist()):
             if site.free[floor, column]:
-                details.window(rng, glass, (left, top, right - left, bottom - top), tpm)
+                pane = (left, top, right - left, bottom - top)
+                details.window(site.window_rng(), glass, pane, tpm)
                 openings.append((left, top, right, bottom))
     holes = np.array(openings).reshape(-1, 4) if recess > 0.0 else np.zeros((0, 4))
     size = (site.width, site.height)
@@ -247,7 +302,7 @@ def _fixtures(site: _Site) -> None:
 
 def _shell(site: _Site) -> None:
     """Build the other walls with painted windows, the roof, and what stands on it."""
-    rng, tpm = site.rng, site.tpm
+    rng, tpm, building = site.rng, site.tpm, site.building
 
     def paint(side: Side, width_m: float, height_m: float) -> Canvas:
         if side == "top":
@@ -260,12 +315,19 @@ def _shell(site: _Site) -> None:
                     details.window(rng, canvas, (left, top, 1.2, bottom - top), tpm)
         return canvas
 
-    size = (site.width, site.height, site.building.depth_m)
-    site.faces += box(site.front, size, paint, "shell", ("left", "right", "top", "back"))
+    size = (site.width, site.height, building.depth_m)
+    outside: tuple[Side, ...] = ("left", "right", "top", "back")
+    plain = [side for side in outside if side not in building.rich_sides]
+    if building.roof == "gable":
+        site.faces += box(site.front, size, paint, "shell", [s for s in plain if s != "top"])
+        footprint = (site.width, building.depth_m)
+        site.faces += roofs.gable(site.front, footprint, building.roof_deg, site.paint, rng, tpm)
+        return
+    site.faces += box(site.front, size, paint, "shell", plain)
     for _ in range(rng.poisson(1.5)):
         width, height = rng.uniform((0.5, 0.8), (1.4, 2.0)).tolist()
         left = float(rng.uniform(0.0, site.width - width))
-        back = -float(rng.uniform(0.5, max(0.6, site.building.depth_m - 2.0)))
+        back = -float(rng.uniform(0.5, max(0.6, building.depth_m - 2.0)))
         frame = site.front.moved(left, -height, back)
         sides: tuple[Side, ...] = ("front", "left", "right", "top", "back")
         site.faces += box(frame, (width, height, width), site.paint, "chimney", sides)

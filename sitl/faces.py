@@ -72,6 +72,7 @@ class Face:
         canvas: (H, W) reflected light under the open sky, grey levels.
         holes: (K, 4) openings, left top right bottom, m.
         name: what it is.
+        casts: whether it throws a shadow; the second side of a thin thing need not.
     """
 
     frame: Frame
@@ -80,6 +81,7 @@ class Face:
     canvas: Canvas
     name: str
     holes: Array = field(default_factory=lambda: np.zeros((0, 4)))
+    casts: bool = True
 
 
 def box(

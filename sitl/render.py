@@ -36,17 +36,20 @@ def render_scenario(scenario: Scenario, out_dir: Path, progress: Progress | None
     Raises:
         RecordingError: the folder cannot be written, or holds something already.
     """
-    sensor = scenario.sensor()
     pair = (KnownPair(*scenario.known_distance),) if scenario.known_distance else ()
     description = Description(scenario.name, scenario.frame_rate_hz, scenario.leader, pair)
     images = ImageOptions(scenario.image.format, scenario.image.jpg_quality)
     with RecordingWriter(out_dir, description, images) as writer:
+        sensors = {drone.name: scenario.sensor(drone) for drone in scenario.drone}
         paths = {drone.name: FlightPath(drone.flight) for drone in scenario.drone}
         for drone in scenario.drone:
-            writer.add_drone(drone.name, sensor, _truth(scenario, drone, paths[drone.name]))
+            truth = _truth(scenario, drone, paths[drone.name])
+            writer.add_drone(drone.name, sensors[drone.name], truth)
         world = build_town(scenario.world)
         renderers = {
-            drone.name: Renderer(world, sensor.camera, scenario.image.imaging(drone.gain))
+            drone.name: Renderer(
+                world, scenario.camera.camera(), scenario.image.imaging(drone.gain)
+            )
             for drone in scenario.drone
         }
         n_total = scenario.n_frames * len(scenario.drone)
@@ -55,7 +58,7 @@ def render_scenario(scenario: Scenario, out_dir: Path, progress: Progress | None
                 at_ns = scenario.frame_at_ns(drone, k)
                 motion = paths[drone.name].at(scenario.flight_s(at_ns))
                 rng = np.random.default_rng([scenario.seed, i, k])
-                world_from_cam = motion.ned_from_body @ sensor.body_from_cam
+                world_from_cam = motion.ned_from_body @ sensors[drone.name].body_from_cam
                 writer.add_frame(
                     drone.name, at_ns, renderers[drone.name].render(world_from_cam, rng)
                 )

@@ -1,6 +1,8 @@
 """A flight as a text: what stands in the world, what the cameras are like, who flies where.
 
-``sitl/scenarios/*.toml`` are known by their names; any other file by its path.
+``sitl/scenarios/*.toml`` are known by their names; any other file by its path. A
+file that says ``based_on = "another"`` is that scenario with some of its top-level
+keys replaced.
 """
 
 from __future__ import annotations
@@ -68,9 +70,10 @@ class Lens(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             self.distortion,
         )
 
-    def body_from_cam(self) -> Pose:
-        """Return where the camera sits."""
-        turn = matrix_from_euler(*np.deg2rad(self.roll_pitch_yaw_deg).tolist())
+    def body_from_cam(self, tilt_deg: float = 0.0) -> Pose:
+        """Return where the camera sits, looking higher by a tilt."""
+        roll, pitch, yaw = np.deg2rad(self.roll_pitch_yaw_deg).tolist()
+        turn = matrix_from_euler(roll, pitch + float(np.deg2rad(tilt_deg)), yaw)
         return Pose(turn @ BODY_FROM_CAM_FORWARD, np.array(self.position_m))
 
 
@@ -104,18 +107,22 @@ class DroneInScenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         flight: its path.
         gain: its camera's exposure against the others'.
         delay_s: how much later than the scenario's instants it takes its frames.
+        tilt_deg: its camera looks so much higher than the others', lower when negative.
     """
 
     name: str
     flight: Flight
     gain: float = 1.0
     delay_s: float = 0.0
+    tilt_deg: float = 0.0
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"mav[0-9]{1,6}", self.name):
             raise ValueError(f"drone: names are mav0, mav1, ...; got {self.name!r}")
         if not self.gain > 0.0 or not 0.0 <= self.delay_s < 10.0:
             raise ValueError(f"drone {self.name}: gain is positive, delay_s is 0 to 10")
+        if not -90.0 <= self.tilt_deg <= 90.0:
+            raise ValueError(f"drone {self.name}: tilt_deg is -90 to 90")
 
 
 class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -174,9 +181,10 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Return an instant of recording time as the flight's own time, s."""
         return (at_ns - self.start_at_ns) * 1e-9
 
-    def sensor(self) -> Sensor:
-        """Return what ``sensor.yaml`` will say."""
-        return Sensor(self.camera.camera(), self.camera.body_from_cam(), self.frame_rate_hz, "NED")
+    def sensor(self, drone: DroneInScenario) -> Sensor:
+        """Return what a drone's ``sensor.yaml`` will say."""
+        mounting = self.camera.body_from_cam(drone.tilt_deg)
+        return Sensor(self.camera.camera(), mounting, self.frame_rate_hz, "NED")
 
 
 def scenario_names() -> list[str]:
@@ -197,17 +205,28 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
         if str(name_or_path) not in scenario_names():
             known = ", ".join(scenario_names())
             raise ConfigError(f"no scenario {str(name_or_path)!r}; there are: {known}")
-    try:
-        table = tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not TOML ({' '.join(str(error).split())})") from None
+    table = _table(path)
+    base = table.pop("based_on", None)
+    if base is not None:
+        if base not in scenario_names():
+            known = ", ".join(scenario_names())
+            raise ConfigError(f"{path}: based_on is one of {known}; got {base!r}")
+        table = {**_table(SCENARIOS / f"{base}.toml"), **table}
     _refuse_unknown(table, Scenario, path, "")
     try:
         return msgspec.convert(table, Scenario)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{path}: {error}") from None
+
+
+def _table(path: Path) -> dict[str, Any]:
+    """Return what a file says, or raise ConfigError in one line."""
+    try:
+        return tomllib.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: not TOML ({' '.join(str(error).split())})") from None
 
 
 def _refuse_unknown(value: object, kind: Any, path: Path, where: str) -> None:

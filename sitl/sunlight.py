@@ -72,7 +72,7 @@ def lit(faces: Sequence[Face], sun: Sun) -> tuple[Surface, ...]:
             overlaps = np.all((low <= high[i]) & (high >= low[i]), axis=1)
             overlaps &= height.max(axis=1) > height[i].min()
             overlaps[i] = False
-            blockers = [faces[j] for j in np.flatnonzero(overlaps).tolist()]
+            blockers = [faces[j] for j in np.flatnonzero(overlaps).tolist() if faces[j].casts]
             shadow = _shadow(face, blockers, towards)
             light = 1.0 + sun.strength * incidence * (1.0 - shadow)
             canvas = canvas * np.asarray(light, dtype=np.float32)
@@ -104,8 +104,10 @@ def _shadow(face: Face, blockers: Sequence[Face], towards: Array) -> Canvas:
     scale = shape / size
     mask = np.zeros((shape[1], shape[0]), dtype=np.uint8)
     axes = np.stack([face.frame.right, face.frame.down], axis=1)
-    for blocker in blockers:
-        outline = _cast(blocker, (0.0, 0.0, blocker.width_m, blocker.height_m), face, towards)
+    for blocker, cast in _cast_all(blockers, face, towards):
+        outline = cast
+        if outline is None:
+            outline = _cast(blocker, (0.0, 0.0, blocker.width_m, blocker.height_m), face, towards)
         if outline is None:
             continue
         layer = np.zeros_like(mask) if len(blocker.holes) else mask
@@ -126,6 +128,31 @@ def _shadow(face: Face, blockers: Sequence[Face], towards: Array) -> Canvas:
 def _texels(points_m: Array, scale: Array) -> np.ndarray[tuple[int, int], np.dtype[np.int32]]:
     texels = np.clip(points_m * scale - 0.5, -1e6, 1e6)
     return np.asarray(np.rint(texels), dtype=np.int32).reshape(-1, 2)
+
+
+def _cast_all(
+    blockers: Sequence[Face], face: Face, towards: Array
+) -> list[tuple[Face, Array | None]]:
+    """Throw all blockers onto a face's plane at once.
+
+    Returns:
+        Those that do not lie behind the plane, each with its (4, 3) outline as
+        ``_cast`` gives it, or with None where the plane cuts it.
+    """
+    if not blockers:
+        return []
+    right = np.array([b.width_m * b.frame.right for b in blockers])
+    down = np.array([b.height_m * b.frame.down for b in blockers])
+    corner = np.array([b.frame.origin for b in blockers]) - face.frame.origin
+    points = np.stack([corner, corner + right, corner + right + down, corner + down], axis=1)
+    outward = -face.frame.inward
+    height = points @ outward - _CLEARANCE_M
+    outlines = points - (points @ outward / (towards @ outward))[..., None] * towards
+    whole = height.min(axis=1) > 0.0
+    return [
+        (blockers[i], outlines[i] if whole[i] else None)
+        for i in np.flatnonzero(height.max(axis=1) > 0.0).tolist()
+    ]
 
 
 def _cast(

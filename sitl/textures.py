@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Canvas = NDArray[np.float32]
-Style = Literal["brick", "ashlar", "plaster", "concrete", "plain", "asphalt", "paving"]
+Style = Literal[
+    "brick", "ashlar", "plaster", "concrete", "plain", "asphalt", "paving", "tiles", "grass"
+]
 
 _Rng = np.random.Generator
 
@@ -71,6 +73,8 @@ def material(rng: _Rng, style: Style, shape: tuple[int, int], texels_per_m: floa
         "plain": _plain,
         "asphalt": _asphalt,
         "paving": _paving,
+        "tiles": _tiles,
+        "grass": _grass,
     }
     return painters[style](rng, shape, texels_per_m)
 
@@ -233,3 +237,29 @@ def _paving(rng: _Rng, shape: tuple[int, int], texels_per_m: float) -> Canvas:
     canvas = np.asarray(out, dtype=np.float32)
     stains(rng, canvas, texels_per_m, 0.4)
     return canvas
+
+
+def _tiles(rng: _Rng, shape: tuple[int, int], texels_per_m: float) -> Canvas:
+    """Paint a roof: overlapping courses, each shading the next, with moss and mended places."""
+    tone = rng.uniform(70, 105)
+    course, breadth = 0.33 * texels_per_m, 0.24 * texels_per_m
+    rows = (np.arange(shape[0]) / course).astype(np.int32)
+    offsets = (rows % 2) * 0.5 * breadth
+    columns = ((np.arange(shape[1])[None, :] + offsets[:, None]) / breadth).astype(np.int32)
+    tones = rng.normal(1.0, 0.09, (rows[-1] + 1, columns.max() + 1)).astype(np.float32)
+    tones[rng.random(tones.shape) < 0.04] *= 1.4
+    fall = 1.1 - 0.35 * ((np.arange(shape[0]) % course) / course) ** 3
+    out = np.float32(tone) * tones[rows[:, None], columns] * fall[:, None].astype(np.float32)
+    out *= 1.0 + 0.06 * noise(rng, shape, texels_per_m, 4.0, 0.1, 0.7)
+    moss = noise(rng, shape, texels_per_m, 2.0, 0.1, 0.6)
+    canvas = np.asarray(np.where(moss > 1.5, out * 0.72, out), dtype=np.float32)
+    stains(rng, canvas, texels_per_m, 0.5)
+    return canvas
+
+
+def _grass(rng: _Rng, shape: tuple[int, int], texels_per_m: float) -> Canvas:
+    """Paint a mown meadow: soft mottling, hardly a corner."""
+    tone = 78.0 * (1.0 + 0.07 * noise(rng, shape, texels_per_m, 12.0, 0.8, 0.3))
+    return np.asarray(
+        tone * (1.0 + 0.03 * noise(rng, shape, texels_per_m, 0.8, 0.1, 0.2)), np.float32
+    )

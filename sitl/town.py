@@ -1,4 +1,4 @@
-"""A town from its description: buildings, pavements, clutter, ground and sky."""
+"""A town from its description: buildings, streets, trees, clutter, ground and sky."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import numpy as np
 from sitl import details
 from sitl.building import Building, build
 from sitl.faces import Face, Frame, Side, box
+from sitl.street import Street, pave
 from sitl.sunlight import Sun, lit
 from sitl.textures import Canvas, Style, material, noise
+from sitl.trees import Tree, plant
 from sitl.world import Texture, World
 
-_GROUND_TEXELS_PER_M = 10.0
 _PAVEMENT_TEXELS_PER_M = 32.0
 _SKY_TEXELS = 1024
 _UPRIGHT: tuple[Side, ...] = ("front", "left", "right", "top", "back")
@@ -49,7 +50,8 @@ class Town(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         sun_azimuth_deg, sun_elevation_deg, sun_strength: see ``Sun``.
         texels_per_m: resolution of the buildings' paint.
         ground_half_m: the ground reaches so far from the origin.
-        building, pavement, clutter: what stands there.
+        ground_style, ground_texels_per_m: what it is made of and how finely.
+        building, pavement, clutter, street, tree: what stands there.
     """
 
     seed: int = 1
@@ -58,13 +60,19 @@ class Town(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sun_strength: float = Sun.strength
     texels_per_m: float = 56.0
     ground_half_m: float = 90.0
+    ground_style: Style = "asphalt"
+    ground_texels_per_m: float = 10.0
     building: tuple[Building, ...] = ()
     pavement: tuple[Pavement, ...] = ()
     clutter: tuple[Clutter, ...] = ()
+    street: tuple[Street, ...] = ()
+    tree: tuple[Tree, ...] = ()
 
     def __post_init__(self) -> None:
         if not 2.0 <= self.texels_per_m <= 200.0 or not 1.0 <= self.ground_half_m <= 1000.0:
             raise ValueError("town: texels_per_m is 2 to 200, ground_half_m is 1 to 1000")
+        if not 1.0 <= self.ground_texels_per_m <= 40.0:
+            raise ValueError("town: ground_texels_per_m is 1 to 40")
         self.sun()
 
     def sun(self) -> Sun:
@@ -76,13 +84,18 @@ def build_town(town: Town) -> World:
     """Build the world that a description asks for; the same one every time."""
     faces = [_ground(town)]
     for i, pavement in enumerate(town.pavement):
-        faces += _pavement(pavement, np.random.default_rng([town.seed, 1, i]))
+        faces += _pavement(pavement, np.random.default_rng([town.seed, 1, i]), town.texels_per_m)
     for i, building in enumerate(town.building):
         rng = np.random.default_rng([town.seed, 2, building.seed or 1000 + i])
         faces += build(building, rng, town.texels_per_m)
     for i, clutter in enumerate(town.clutter):
         rng = np.random.default_rng([town.seed, 3, i])
         faces += _clutter(clutter, rng, town.texels_per_m)
+    for i, street in enumerate(town.street):
+        rng = np.random.default_rng([town.seed, 5, street.seed or 1000 + i])
+        faces += pave(street, rng, town.texels_per_m)
+    for i, tree in enumerate(town.tree):
+        faces += plant(tree, np.random.default_rng([town.seed, 6, i]), town.texels_per_m)
     return World(lit(faces, town.sun()), _sky(np.random.default_rng([town.seed, 4])))
 
 
@@ -94,15 +107,15 @@ def _flat(x_m: float, y_m: float, z_m: float) -> Frame:
 
 def _ground(town: Town) -> Face:
     half = town.ground_half_m
-    tpm = min(_GROUND_TEXELS_PER_M, 8000.0 / half)
+    tpm = min(town.ground_texels_per_m, 8000.0 / half)
     texels = round(2 * half * tpm)
     rng = np.random.default_rng([town.seed, 0])
-    canvas = material(rng, "asphalt", (texels, texels), tpm)
+    canvas = material(rng, town.ground_style, (texels, texels), tpm)
     return Face(_flat(half, -half, 0.0), 2 * half, 2 * half, canvas, "ground")
 
 
-def _pavement(pavement: Pavement, rng: np.random.Generator) -> list[Face]:
-    tpm = _PAVEMENT_TEXELS_PER_M
+def _pavement(pavement: Pavement, rng: np.random.Generator, texels_per_m: float) -> list[Face]:
+    tpm = min(texels_per_m, _PAVEMENT_TEXELS_PER_M)
 
     def paint(side: Side, width_m: float, height_m: float) -> Canvas:
         shape = (max(2, round(height_m * tpm)), max(2, round(width_m * tpm)))

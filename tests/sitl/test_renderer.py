@@ -220,7 +220,7 @@ def test_a_lens_that_cannot_be_inverted_is_refused() -> None:
 def test_the_demo_town_is_rich_and_its_corners_are_found_again(demo_world: World) -> None:
     """AKAZE finds corners all over, and the same ones from another drone's place."""
     scenario = load_scenario("demo")
-    sensor = scenario.sensor()
+    sensor = scenario.sensor(scenario.drone[0])
     detector = cv2.AKAZE.create()
     found, depth = [], []
     for i in (0, 1):

@@ -101,6 +101,26 @@ def test_an_unknown_scenario_names_the_known_ones(tmp_path: Path) -> None:
         load_scenario(tmp_path / "absent.toml")
 
 
+def test_a_scenario_based_on_another_replaces_top_level_keys_only(tmp_path: Path) -> None:
+    base = load_scenario("demo")
+    changed = load_text(tmp_path, 'based_on = "demo"\nname = "longer"\nduration_s = 20.0\n')
+    assert (changed.name, changed.duration_s) == ("longer", 20.0)
+    assert changed.drone == base.drone
+    assert changed.world == base.world
+    with pytest.raises(ConfigError, match=r"based_on is one of .*demo.*'nowhere'"):
+        load_text(tmp_path, 'based_on = "nowhere"')
+
+
+def test_a_tilted_camera_looks_higher_than_the_others(tmp_path: Path) -> None:
+    text = SMALL.replace('name = "mav1"\n', 'name = "mav1"\ntilt_deg = 20.0\n')
+    scenario = load_text(tmp_path, text)
+    level, tilted = (scenario.sensor(drone).body_from_cam for drone in scenario.drone)
+    axis = np.array([0.0, 0.0, 1.0])
+    up = [-np.rad2deg(np.arcsin((pose.rotation @ axis)[2])) for pose in (level, tilted)]
+    assert up == pytest.approx([-5.0, 15.0], abs=1e-9)
+    assert tilted.translation == pytest.approx(level.translation)
+
+
 FLIGHT = Flight(
     waypoints=(
         (0.0, 0.0, 0.0, -4.0, 0.0),

@@ -7,9 +7,11 @@ import pytest
 
 from sitl.building import Building
 from sitl.faces import Frame, Side, box
+from sitl.street import Street
 from sitl.sunlight import Sun, lit
 from sitl.textures import Canvas, noise
 from sitl.town import Clutter, Pavement, Town, build_town
+from sitl.trees import Tree
 from sitl.world import SKY, Surface, Texture, World
 from vcl_companion.geometry.rotation import Array
 
@@ -174,3 +176,99 @@ def test_a_front_has_relief_in_front_of_and_behind_its_wall() -> None:
     assert 0.05 < behind < 0.5
     assert 0.05 < before < 0.7
     assert 0.1 < on_the_wall < 0.8
+
+
+def built_alone(building: Building) -> World:
+    town = Town(
+        seed=2, texels_per_m=12.0, ground_half_m=20.0, building=(building,), sun_strength=0.0
+    )
+    return build_town(town)
+
+
+def test_a_gable_roof_closes_the_house_and_rises_to_its_ridge() -> None:
+    """No ray from above or from beside passes between roof and gables into the house."""
+    house = Building(10.0, 0.0, 180.0, 10.0, depth_m=8.0, height_m=6.0, roof="gable", roof_deg=45.0)
+    world = built_alone(house)
+    slopes = [s for s in world.surfaces if s.name in ("roof", "roof back")]
+    for slope in slopes:
+        assert slope.corner[2] == pytest.approx(-10.0)  # a ridge 4 m above the eaves
+        assert slope.point(0.0, slope.height_m)[2] == pytest.approx(-6.0)
+        assert slope.outward[2] == pytest.approx(-np.sqrt(0.5))
+    # Whoever looks at a place just under the tiles or just inside a gable meets them first.
+    x, y = np.meshgrid(np.linspace(10.2, 17.8, 40), np.linspace(-4.8, 4.8, 40))
+    rise = np.minimum(x - 10.0, 18.0 - x)
+    inside = np.stack([x.ravel(), y.ravel(), (-6.0 - rise + 0.15).ravel()], axis=1)
+    for viewer in ([14.0, 0.0, -60.0], [-40.0, 0.0, -40.0], [14.0, 90.0, -20.0]):
+        assert world.intersect(np.array(viewer), inside - viewer).distance.max() < 1.0
+    x, up = np.meshgrid(np.linspace(10.2, 17.8, 40), np.linspace(0.1, 0.95, 30))
+    for side in (-1.0, 1.0):
+        height = 6.0 + up * np.minimum(x - 10.0, 18.0 - x)
+        gable = np.stack([x, np.full_like(x, side * 4.95), -height], axis=-1).reshape(-1, 3)
+        origin = np.array([14.0, side * 60.0, -8.0])
+        assert world.intersect(origin, gable - origin).distance.max() < 1.0
+
+
+def test_rich_sides_have_relief_and_plain_ones_do_not() -> None:
+    rich = Building(10.0, 0.0, 180.0, 8.0, depth_m=8.0, height_m=8.0, rich_sides=("left",), seed=3)
+    x, z = np.meshgrid(np.linspace(10.3, 17.7, 40), np.linspace(-7.5, -0.5, 40))
+    spread = {}
+    for name, side in (("left", -1.0), ("right", 1.0)):
+        origin = np.array([14.0, side * 40.0, -4.0])
+        targets = np.stack([x.ravel(), np.full(x.size, side * 4.0), z.ravel()], axis=1)
+        met = built_alone(rich).intersect(origin, targets - origin).points_world[:, 1]
+        spread[name] = float(np.mean(np.abs(np.abs(met) - 4.0) > 0.05))
+    # The viewer of a front that looks south has west on the left.
+    assert 0.2 < spread["left"] < 0.9
+    assert spread["right"] < 0.02
+
+
+def test_windows_that_are_alike_stand_evenly() -> None:
+    """All openings of a block of flats are as wide as one another and as far apart."""
+    holes = {}
+    for alike in (0.0, 1.0):
+        flats = Building(10.0, 0.0, 180.0, 16.0, height_m=8.0, alike=alike, bays=0, seed=3)
+        front = next(s for s in built_alone(flats).surfaces if s.name == "front")
+        holes[alike] = np.unique(np.round(front.holes[:, [0, 2]], 9), axis=0)
+    widths = {alike: np.ptp(np.diff(h, axis=1)) for alike, h in holes.items()}
+    steps = {alike: np.ptp(np.diff(h.mean(axis=1))) for alike, h in holes.items()}
+    assert widths[1.0] == pytest.approx(0.0, abs=1e-6)
+    assert steps[1.0] == pytest.approx(0.0, abs=1e-6)
+    assert widths[0.0] > 0.1
+    assert steps[0.0] > 0.1
+
+
+def test_a_street_lies_between_its_kerbs_whichever_way_it_runs() -> None:
+    for heading in np.deg2rad([0.0, 90.0, 215.0]):
+        along = np.array([np.cos(heading), np.sin(heading), 0.0])
+        right = np.array([-along[1], along[0], 0.0])
+        start = np.array([2.0, -3.0, 0.0])
+        end = start + 12.0 * along
+        street = Street(
+            start[0], start[1], end[0], end[1], road_m=6.0, parked=0.0, lamp_every_m=0.0
+        )
+        world = build_town(
+            Town(texels_per_m=8.0, ground_half_m=30.0, sun_strength=0.0, street=(street,))
+        )
+        for out_m, height_m in ((0.0, 0.03), (2.9, 0.03), (3.1, 0.14), (5.4, 0.14), (5.6, 0.0)):
+            for side in (-1.0, 1.0):
+                above = start + 6.0 * along + side * out_m * right - np.array([0.0, 0.0, 5.0])
+                met = world.intersect(above, DOWN[None]).points_world[0]
+                assert -met[2] == pytest.approx(height_m, abs=1e-9)
+
+
+def test_parked_cars_leave_crossings_free_and_a_tree_stands_where_it_was_planted() -> None:
+    street = Street(0.0, 0.0, 40.0, 0.0, parked=1.0, lamp_every_m=0.0, crossings=(20.0,))
+    tree = Tree(0.0, 20.0, height_m=7.0, crown_m=4.0)
+    world = build_town(
+        Town(texels_per_m=8.0, ground_half_m=45.0, sun_strength=0.0, street=(street,), tree=(tree,))
+    )
+    cars = [s for s in world.surfaces if s.name in ("car top", "van top")]
+    middles = np.array([s.point(s.width_m / 2, s.height_m / 2)[:2] for s in cars])
+    assert 8 <= len(cars) <= 10
+    assert np.abs(middles[:, 0] - 20.0).min() > 3.5
+    assert np.all((np.abs(middles[:, 1]) > 2.0) & (np.abs(middles[:, 1]) < 4.0))
+    leaves = np.array(
+        [s.point(s.width_m / 2, s.height_m / 2) for s in world.surfaces if s.name == "leaves"]
+    )
+    reach = np.linalg.norm(leaves - [0.0, 20.0, -5.0], axis=1)
+    assert 0.9 < reach.min() < reach.max() <= 2.0 + 1e-9
