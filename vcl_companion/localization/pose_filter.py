@@ -19,6 +19,7 @@ import numpy as np
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, log_so3
+from vcl_companion.localization.covariance_intersection import intersect, unlikeness
 from vcl_companion.localization.intra import Localized, NotLocalized, Prior
 
 _P, _B, _V, _W = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
@@ -28,6 +29,9 @@ _GATE_POSE, _GATE_ROTATION = 27.9, 21.1
 # What is known after a jump, 1 sigma: nothing.
 _FORGOTTEN_M, _FORGOTTEN_M_S, _FORGOTTEN_RAD = 1e3, 10.0, np.pi
 _MAX_COAST_S = 60.0
+# A proposal has to take this much of the variance away to be news.
+_NEWS = 0.95
+_LEAST_OMEGA = 1e-3
 
 
 @dataclass(frozen=True)
@@ -221,19 +225,91 @@ def update(predicted: FilterState, fix: Localized) -> FilterState | NotLocalized
     # Joseph's form holds for any gain, so for a considered state too.
     keep = np.eye(len(predicted.covariance)) - gain @ observation
     covariance = keep @ predicted.covariance @ keep.T + gain @ noise @ gain.T
-    offset = exp_so3(step[_B]) @ predicted.world_from_ned
-    attitude = np.eye(3) if predicted.ned_from_body is None else predicted.ned_from_body
     return replace(
-        predicted,
-        world_from_body=Pose(
-            offset @ attitude @ exp_so3(step[_W]),
-            predicted.world_from_body.translation + step[_P],
-        ),
-        velocity_world=predicted.velocity_world + step[_V],
-        world_from_ned=offset,
+        _stepped(predicted, step),
         covariance=0.5 * (covariance + covariance.T),
         own_map_covariance=fix.own_map_covariance,
         fixed_at_ns=predicted.at_ns,
+    )
+
+
+@dataclass(frozen=True)
+class NotFused:
+    """A proposal was not taken, and why."""
+
+    reason: str
+
+
+def fuse(
+    state: FilterState, world_from_body: Pose, covariance: Array, arm_m: float
+) -> FilterState | NotFused:
+    """Fuse what a peer says of our pose at the state's instant (eqs. 10 and 11).
+
+    What is correlated with what is unknown: both came from the same map, and
+    what the peer knows may have come from us. Covariance intersection is a
+    Kalman update after both sides are widened, ours by 1/omega, the proposal by
+    1/(1 - omega).
+
+    Args:
+        state: of the instant that the proposal is about.
+        world_from_body: where the peer says that we were.
+        covariance: (6, 6) local, of that.
+        arm_m: distance of the scene, to weigh radians against metres.
+
+    Returns:
+        The state with the proposal in it; unchanged when the proposal has
+        little to add; or why it is not taken: a pose that the covariances
+        cannot explain at any correlation.
+    """
+    own = state.pose_covariance()
+    try:
+        weighed = intersect(state.world_from_body, own, world_from_body, covariance, arm_m)
+    except ValueError as error:
+        return NotFused(str(error))
+    distance = unlikeness(state.world_from_body, own, world_from_body, covariance)
+    if not distance <= _GATE_POSE:
+        metres = np.linalg.norm(world_from_body.translation - state.world_from_body.translation)
+        return NotFused(f"{metres:.1f} m from where we are, more than both sigmas explain")
+    units = np.diag([1.0, 1.0, 1.0, arm_m, arm_m, arm_m]) ** 2
+    if np.trace(units @ weighed.covariance) > _NEWS * np.trace(units @ own):
+        return state  # widening what the proposal says nothing of would cost more
+    omega = min(max(weighed.omega, _LEAST_OMEGA), 1.0 - _LEAST_OMEGA)
+    rotation = state.world_from_body.rotation
+    observation = _to_pose(rotation, len(state.covariance))
+    # The landmarks' own errors are part of what is widened, and absorbed with it.
+    absorbing = np.zeros((len(state.covariance), 6))
+    absorbing[_P, :3] = absorbing[_B, 3:] = rotation
+    prior = state.covariance + absorbing @ state.own_map_covariance @ absorbing.T
+    prior /= omega
+    noise = covariance / (1.0 - omega)
+    expected = observation @ prior @ observation.T + noise
+    gain = np.linalg.solve(expected, observation @ prior).T
+    gain[_N_OWN:] = 0.0
+    step = gain @ state.world_from_body.local(world_from_body)
+    keep = np.eye(len(prior)) - gain @ observation
+    fused = keep @ prior @ keep.T + gain @ noise @ gain.T
+    # The keyframes' own errors did not grow; scaling them back keeps the correlations.
+    fused[_N_OWN:] *= np.sqrt(omega)
+    fused[:, _N_OWN:] *= np.sqrt(omega)
+    fused[_N_OWN:, _N_OWN:] = state.covariance[_N_OWN:, _N_OWN:]
+    return replace(
+        _stepped(state, step),
+        covariance=0.5 * (fused + fused.T),
+        own_map_covariance=np.zeros((6, 6)),
+    )
+
+
+def _stepped(state: FilterState, step: Array) -> FilterState:
+    """Return the state moved by an error state; the covariance as it was."""
+    turned = exp_so3(step[_B])
+    return replace(
+        state,
+        world_from_body=Pose(
+            turned @ state.world_from_body.rotation @ exp_so3(step[_W]),
+            state.world_from_body.translation + step[_P],
+        ),
+        velocity_world=state.velocity_world + step[_V],
+        world_from_ned=turned @ state.world_from_ned,
     )
 
 

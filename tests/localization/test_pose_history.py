@@ -1,0 +1,168 @@
+"""Proposals fused into the state at their own time, whenever they come."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.checks import assert_pose_close
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array, matrix_from_euler
+from vcl_companion.localization.intra import Localized
+from vcl_companion.localization.pose_filter import (
+    FilterOptions,
+    FilterState,
+    NotFused,
+    fuse,
+    predict,
+    started,
+    update,
+)
+from vcl_companion.localization.pose_history import PoseHistory
+
+OPTIONS = FilterOptions()
+FRAME_NS = 200_000_000
+ARM_M = 12.0
+
+
+def truth_at(k: int) -> Pose:
+    return Pose(matrix_from_euler(0.01, 0.02, 0.03 * k), np.array([0.3 * k, 0.1 * k, -2.0]))
+
+
+def fix_at(pose: Pose, sigma_m: float = 0.02, own_m: float = 0.0) -> Localized:
+    noise = np.diag([sigma_m**2] * 3 + [(sigma_m / ARM_M) ** 2] * 3)
+    own = np.diag([own_m**2] * 3 + [(own_m / ARM_M) ** 2] * 3)
+    lever, keyframes = np.zeros((6, 12)), np.zeros((12, 12))
+    lever[:, 6:] = np.eye(6)
+    keyframes[6:, 6:] = np.diag([1e-4] * 3 + [1e-6] * 3)
+    return Localized(pose, noise, own, lever, keyframes, 100, 90, True, 0.4)
+
+
+def flown(
+    rng: np.random.Generator, n: int, sigma_m: float = 0.02, own_m: float = 0.0
+) -> tuple[PoseHistory, list[Localized]]:
+    history = PoseHistory(5.0, OPTIONS)
+    fixes = []
+    for k in range(n):
+        truth = truth_at(k)
+        off = rng.normal(0.0, sigma_m, 6) / np.array([1, 1, 1, ARM_M, ARM_M, ARM_M])
+        fix = fix_at(truth.retracted(off), sigma_m, own_m)
+        fixes.append(fix)
+        advance(history, k, fix)
+    return history, fixes
+
+
+def advance(history: PoseHistory, k: int, fix: Localized) -> None:
+    attitude = truth_at(k).rotation
+    if history.newest is None:
+        state = started(fix, k * FRAME_NS, attitude, OPTIONS)
+    else:
+        predicted = predict(history.newest, k * FRAME_NS, attitude, OPTIONS)
+        assert predicted is not None
+        updated = update(predicted, fix)
+        assert isinstance(updated, FilterState)
+        state = updated
+    history.append(state, fix, attitude)
+
+
+def newest(history: PoseHistory) -> FilterState:
+    assert history.newest is not None
+    return history.newest
+
+
+def sharp(sigma_m: float = 0.005) -> Array:
+    return np.diag([sigma_m**2] * 3 + [(sigma_m / ARM_M) ** 2] * 3)
+
+
+def test_a_late_proposal_is_worth_as_much_as_one_in_time() -> None:
+    """Fused at once and flown on, or flown on and fused late: the same state."""
+    rng = np.random.default_rng(1)
+    late, fixes = flown(rng, 8, sigma_m=0.3)
+    proposal = truth_at(3).retracted(rng.normal(0.0, 0.004, 6) / np.array([1, 1, 1, 12, 12, 12]))
+    in_time = PoseHistory(5.0, OPTIONS)
+    for k, fix in enumerate(fixes):
+        advance(in_time, k, fix)
+        if k == 3:
+            assert isinstance(in_time.fuse(3 * FRAME_NS, proposal, sharp(), ARM_M), FilterState)
+    fused = late.fuse(3 * FRAME_NS, proposal, sharp(), ARM_M)
+    assert isinstance(fused, FilterState)
+    assert fused is newest(late)
+    assert_pose_close(
+        fused.world_from_body, newest(in_time).world_from_body, within_m=1e-12, within_rad=1e-12
+    )
+    np.testing.assert_allclose(fused.covariance, newest(in_time).covariance, atol=1e-12)
+
+
+def test_a_starved_drone_takes_what_the_peer_knows() -> None:
+    rng = np.random.default_rng(2)
+    history, _ = flown(rng, 4, sigma_m=0.8, own_m=0.5)
+    before = newest(history)
+    fused = history.fuse(3 * FRAME_NS, truth_at(3), sharp(), ARM_M)
+    assert isinstance(fused, FilterState)
+    off_before = np.linalg.norm(before.world_from_body.local(truth_at(3))[:3])
+    assert off_before > 0.1
+    assert_pose_close(fused.world_from_body, truth_at(3), within_m=0.03, within_rad=0.003)
+    sigma_m = np.sqrt(np.diag(fused.pose_covariance())[:3])
+    assert np.all(sigma_m < 0.02)
+    assert np.all(sigma_m > 0.002)
+
+
+def test_the_same_opinion_twice_is_no_news() -> None:
+    """A Kalman update would halve the covariance each time that an echo comes back."""
+    history, _ = flown(np.random.default_rng(3), 6)
+    state = newest(history)
+    for _ in range(20):
+        echo = fuse(state, state.world_from_body, state.pose_covariance(), ARM_M)
+        assert isinstance(echo, FilterState)
+        state = echo
+    assert state is newest(history)
+
+
+def test_a_proposal_worse_than_our_own_changes_nothing() -> None:
+    history, _ = flown(np.random.default_rng(4), 6)
+    before = newest(history)
+    off = truth_at(5).retracted(np.array([0.4, -0.3, 0.2, 0.02, 0.0, -0.02]))
+    fused = history.fuse(5 * FRAME_NS, off, np.eye(6) * 4.0, ARM_M)
+    assert isinstance(fused, FilterState)
+    assert_pose_close(fused.world_from_body, before.world_from_body, within_m=1e-9, within_rad=1e-9)
+    np.testing.assert_array_equal(fused.covariance, before.covariance)
+
+
+def test_what_no_sigma_explains_is_refused_and_changes_nothing() -> None:
+    history, _ = flown(np.random.default_rng(5), 6)
+    before = newest(history)
+    far = truth_at(5).retracted(np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    refused = history.fuse(5 * FRAME_NS, far, sharp(), ARM_M)
+    assert isinstance(refused, NotFused)
+    assert "5.0 m from where we are" in refused.reason
+    assert newest(history) is before
+
+
+def test_what_is_older_than_the_history_is_refused() -> None:
+    history, _ = flown(np.random.default_rng(6), 40)
+    refused = history.fuse(2 * FRAME_NS, truth_at(2), sharp(), ARM_M)
+    assert isinstance(refused, NotFused)
+    assert "7.4 s ago" in refused.reason
+    assert isinstance(history.fuse(30 * FRAME_NS, truth_at(30), sharp(), ARM_M), FilterState)
+    between = history.fuse(30 * FRAME_NS + FRAME_NS // 2, truth_at(30), sharp(), ARM_M)
+    assert isinstance(between, NotFused)
+
+
+def test_without_any_state_there_is_nothing_to_fuse_with() -> None:
+    history, _ = flown(np.random.default_rng(7), 2)
+    history.clear()
+    assert isinstance(history.fuse(0, truth_at(0), sharp(), ARM_M), NotFused)
+
+
+@pytest.mark.parametrize("broken", [np.full((6, 6), np.nan), np.zeros((6, 6)), -np.eye(6)])
+def test_a_covariance_that_is_none_is_refused(broken: Array) -> None:
+    history, _ = flown(np.random.default_rng(8), 2)
+    assert isinstance(history.fuse(FRAME_NS, truth_at(1), broken, ARM_M), NotFused)
+
+
+def test_states_come_in_order() -> None:
+    history, fixes = flown(np.random.default_rng(9), 3)
+    with pytest.raises(ValueError, match="order"):
+        history.append(started(fixes[0], 0, None, OPTIONS), fixes[0], None)
+    with pytest.raises(ValueError, match="length_s"):
+        PoseHistory(0.0, OPTIONS)

@@ -1,0 +1,116 @@
+"""The last seconds of a drone's estimates, so that what comes late is fused at its own time.
+
+A peer's proposal says where the drone was when the frame was taken. It is fused
+into the state of that instant, and what has been measured since is applied
+again on top of it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.localization.intra import Localized
+from vcl_companion.localization.pose_filter import (
+    FilterOptions,
+    FilterState,
+    NotFused,
+    fuse,
+    predict,
+    update,
+)
+
+# A proposal is for a frame's own instant; clocks may round it.
+_SAME_INSTANT_NS = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """One frame: the state after it, and what made it so."""
+
+    state: FilterState
+    fix: Localized | None
+    ned_from_body: Array | None
+
+
+class PoseHistory:
+    """States of the recent frames, in order.
+
+    Args:
+        length_s: how far back a proposal may reach.
+        options: the filter's, to apply measurements again.
+    """
+
+    def __init__(self, length_s: float, options: FilterOptions) -> None:
+        if not length_s > 0:
+            raise ValueError(f"length_s must be positive, got {length_s}")
+        self._length_ns = round(length_s * 1e9)
+        self._options = options
+        self._steps: deque[_Step] = deque()
+
+    @property
+    def newest(self) -> FilterState | None:
+        """The state after the last frame."""
+        return self._steps[-1].state if self._steps else None
+
+    def clear(self) -> None:
+        """Forget everything: the state has begun anew."""
+        self._steps.clear()
+
+    def append(
+        self, state: FilterState, fix: Localized | None, ned_from_body: Array | None
+    ) -> None:
+        """Keep the state after a frame.
+
+        Args:
+            state: predicted to the frame's instant, and updated by its fix if any.
+            fix: what the frame gave, or None.
+            ned_from_body: (3, 3) attitude of that instant, or None.
+
+        Raises:
+            ValueError: the frame is older than the last one.
+        """
+        if self._steps and state.at_ns < self._steps[-1].state.at_ns:
+            raise ValueError("states must come in the order of their time")
+        self._steps.append(_Step(state, fix, ned_from_body))
+        while self._steps[0].state.at_ns < state.at_ns - self._length_ns:
+            self._steps.popleft()
+
+    def fuse(
+        self, at_ns: int, world_from_body: Pose, covariance: Array, arm_m: float
+    ) -> FilterState | NotFused:
+        """Fuse a peer's proposal at its own time, and bring what came since up to date.
+
+        Args:
+            at_ns: instant of the frame that the proposal is about, our clock.
+            world_from_body: where the peer says that we were.
+            covariance: (6, 6) local, of that.
+            arm_m: distance of the scene (``covariance_intersection.intersect``).
+
+        Returns:
+            The newest state with the proposal in it, or why it was not taken.
+        """
+        if not self._steps:
+            return NotFused("there is no state to fuse with")
+        k = min(range(len(self._steps)), key=lambda k: abs(self._steps[k].state.at_ns - at_ns))
+        off_ns = at_ns - self._steps[k].state.at_ns
+        if abs(off_ns) > _SAME_INSTANT_NS:
+            age_s = (self._steps[-1].state.at_ns - at_ns) * 1e-9
+            return NotFused(f"no frame of {age_s:.1f} s ago is remembered")
+        fused = fuse(self._steps[k].state, world_from_body, covariance, arm_m)
+        if isinstance(fused, NotFused):
+            return fused
+        replayed = [_Step(fused, self._steps[k].fix, self._steps[k].ned_from_body)]
+        for step in list(self._steps)[k + 1 :]:
+            state = predict(replayed[-1].state, step.state.at_ns, step.ned_from_body, self._options)
+            if state is None:
+                return NotFused("the state is too old to go on from")
+            if step.fix is not None:
+                updated = update(state, step.fix)
+                state = updated if isinstance(updated, FilterState) else state
+            replayed.append(_Step(state, step.fix, step.ned_from_body))
+        for n, step in enumerate(replayed):
+            self._steps[k + n] = step
+        return replayed[-1].state
