@@ -1,0 +1,37 @@
+"""The one way hot loops are compiled: numba, kept on disk, without the interpreter's lock.
+
+A kernel calls kernels of its own file only: numba looks at that file alone to
+see whether what it kept on disk is still true.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar, cast
+
+import numba
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Compile a kernel at its first call, or load it from where an earlier process put it.
+
+    Numba keeps its code in ``NUMBA_CACHE_DIR``, else beside the source, else in
+    the user's cache folder. Where none of them can be written (a service of a
+    user without a home) the kernel is compiled anew in every process: slower to
+    start, never a failure.
+
+    Args:
+        function: only numbers, arrays and tuples; division by zero gives infinity.
+
+    Returns:
+        The compiled function, called like the original.
+    """
+    compiler = numba.njit(nogil=True, error_model="numpy")
+    try:
+        kept = numba.njit(nogil=True, error_model="numpy", cache=True)(function)
+    except RuntimeError:  # "no locator available": there is no folder to keep it in
+        kept = compiler(function)
+    return cast("Callable[_P, _R]", kept)
