@@ -91,15 +91,23 @@ def _cv2_resection(
     points: Array, b: Array, focal_px: float, threshold: float, seed: int
 ) -> list[Pose]:
     cv2.setRNGSeed(seed)
-    ok, rotation_vector, translation, _ = cv2.solvePnPRansac(
+    camera, pixels = np.diag([focal_px, focal_px, 1.0]), b * focal_px
+    ok, _, _, inliers = cv2.solvePnPRansac(
         points,
-        b * focal_px,
-        np.diag([focal_px, focal_px, 1.0]),
+        pixels,
+        camera,
         None,
         iterationsCount=_MAX_SAMPLES,
         reprojectionError=threshold,
         confidence=_CONFIDENCE,
         flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not ok or inliers is None or len(inliers) < 4:
+        return []
+    # Its own last step is EPnP, which gets half of all planes wrong: done again, better.
+    chosen = inliers[:, 0]
+    ok, rotation_vector, translation = cv2.solvePnP(
+        points[chosen], pixels[chosen], camera, None, flags=cv2.SOLVEPNP_SQPNP
     )
     return [_pose(cv2.Rodrigues(rotation_vector)[0], translation)] if ok else []
 
