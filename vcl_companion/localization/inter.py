@@ -25,6 +25,7 @@ from vcl_companion.vision.essential import (
     sampson_px,
 )
 from vcl_companion.vision.features import Features
+from vcl_companion.vision.information import covariance_of
 from vcl_companion.vision.matching import MatchOptions, match_mutual, match_to_entries
 from vcl_companion.vision.triangulation import triangulate
 
@@ -285,11 +286,9 @@ class _Pair:
         Infinite where the matches do not fix it.
         """
         normal, _, by_host, lever = self._system(placed.world_from_body, host_pose, placed.agree)
-        size = np.sqrt(np.diag(normal))
-        unit = normal / np.maximum(np.outer(size, size), 1e-300)
-        if not np.linalg.eigvalsh(unit)[0] > _SINGULAR:
+        inverse = covariance_of(normal, _SINGULAR)
+        if inverse is None:
             return np.full((6, 6), np.inf)
-        inverse = np.linalg.inv(normal)
         through = -inverse @ by_host
         shared = -inverse @ lever
         keyframes = self.index.uncertainty.keyframe_covariance

@@ -17,6 +17,7 @@ from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.vision.bundle import Distance, Views, normal_equations
+from vcl_companion.vision.information import covariance_of
 
 # Smallest eigenvalue of an information matrix with ones on its diagonal; rounding leaves 1e-16.
 _SINGULAR = 1e-12
@@ -92,9 +93,7 @@ def _inverse(information: Array) -> Array:
     Raises:
         ValueError: one of them is not positive definite, or hardly is.
     """
-    size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
-    unit = information / (size[..., :, None] * size[..., None, :])
-    if not np.all(np.isfinite(unit)) or np.any(np.linalg.eigvalsh(unit) < _SINGULAR):
+    inverse = covariance_of(information, _SINGULAR)
+    if inverse is None:
         raise ValueError("the map's observations do not fix it")
-    out = np.linalg.inv(unit) / (size[..., :, None] * size[..., None, :])
-    return np.asarray(0.5 * (out + np.swapaxes(out, -1, -2)))
+    return inverse

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.vision.bundle import linearized
+from vcl_companion.vision.information import covariance_of
 
 Mask = NDArray[np.bool_]
 
@@ -213,11 +214,9 @@ def _supported(
         return NotFound(f"{n_inliers} landmarks agree on a pose, {options.min_inliers} needed")
     weighted = _weighted(residual[inliers], j_pose[inliers], information[inliers])
     normal = np.einsum("nik,nkj->ij", weighted, j_pose[inliers])
-    size = np.sqrt(np.diag(normal))
-    unit = normal / np.maximum(np.outer(size, size), 1e-300)
-    if not np.linalg.eigvalsh(unit)[0] > _SINGULAR:
+    inverse = covariance_of(normal, _SINGULAR)
+    if inverse is None:
         return NotFound("the matched landmarks do not fix a pose")
-    inverse = np.linalg.inv(normal)
     gain = np.einsum("ij,njk->nik", inverse, weighted)
     by_landmark = gain @ np.swapaxes(gain, 1, 2)
     return Resection(

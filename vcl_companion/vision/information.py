@@ -1,0 +1,29 @@
+"""From a normal matrix to a covariance, or to the statement that there is none (eq. 12)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vcl_companion.geometry.rotation import Array
+
+
+def covariance_of(information: Array, least_eigenvalue: float) -> Array | None:
+    """Invert normal matrices that fix what they are about.
+
+    Args:
+        information: (..., K, K) symmetric.
+        least_eigenvalue: of the matrix scaled to a diagonal of ones, so that units
+            do not count; what is below is rounding, not information.
+
+    Returns:
+        (..., K, K) inverses, symmetric; None when one of the matrices has a
+        smaller eigenvalue or is not finite.
+    """
+    with np.errstate(all="ignore"):  # whatever the numbers are, they only fail the test
+        size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
+        scale = size[..., :, None] * size[..., None, :]
+        unit = information / scale
+        if not np.all(np.isfinite(unit)) or np.any(np.linalg.eigvalsh(unit) < least_eigenvalue):
+            return None
+        out = np.linalg.inv(unit) / scale
+    return np.asarray(0.5 * (out + np.swapaxes(out, -1, -2)))
