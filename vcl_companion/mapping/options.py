@@ -21,7 +21,9 @@ class MapOptions:
         attitude_sigma_deg: how far two autopilots' relative attitude may be off, 1 sigma.
         distance_sigma_m: how well the known distances are known, 1 sigma.
         max_depth_error: relative depth error, 1 sigma, median over the landmarks,
-            above which the map is refused.
+            above which the map is refused; twice that and a landmark is left out.
+        max_keyframes: an extended map keeps at most this many.
+        max_landmarks: and at most this many landmarks.
         member_wait_s: how long a first map waits for members that are not there yet.
         gather_timeout_s: how long it waits for the frames of those that are.
         directory: where revisions are kept; empty for nowhere.
@@ -35,6 +37,8 @@ class MapOptions:
     attitude_sigma_deg: float = 4.0
     distance_sigma_m: float = 0.01
     max_depth_error: float = 0.1
+    max_keyframes: int = 24
+    max_landmarks: int = 12_000
     member_wait_s: float = 10.0
     gather_timeout_s: float = 20.0
     directory: str = ""
@@ -44,6 +48,12 @@ class MapOptions:
             raise ValueError(f"keyframe_quality must lie in 1..100, got {self.keyframe_quality}")
         if self.min_landmarks < 20:
             raise ValueError(f"min_landmarks must be at least 20, got {self.min_landmarks}")
+        if not 4 <= self.max_keyframes <= 64:
+            raise ValueError(f"max_keyframes must lie in 4..64, got {self.max_keyframes}")
+        if not self.min_landmarks <= self.max_landmarks <= 16_000:
+            raise ValueError(
+                f"max_landmarks must lie in min_landmarks..16000, got {self.max_landmarks}"
+            )
         for name in (
             "min_angle_deg",
             "max_error_px",

@@ -9,21 +9,16 @@ from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.mapping.culling import decisive, fitting, placed
 from vcl_companion.mapping.drone_view import DroneView
-from vcl_companion.mapping.leverage import leverages
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.vision.bundle import (
     BundleOptions,
     Distance,
     Views,
     adjust,
-    reprojection_residuals,
 )
 from vcl_companion.vision.resection import NotFound, ResectionOptions, Sightings, refine, search
-from vcl_companion.vision.triangulation import ray_angles, triangulate
-
-# A landmark that decides more than this of the poses is left out.
-_MAX_LEVERAGE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +42,13 @@ def adjusted(scene: Scene, options: MapOptions) -> Scene:
     used = sorted(scene.cams)
     ideal = scene.ideal.copy()
     for limit_px in (3.0 * options.max_error_px, options.max_error_px):
-        points = triangulate([scene.cams[i] for i in used], ideal[:, used])
+        points = placed([scene.cams[i] for i in used], ideal[:, used])
         scene = replace(scene, points=points, ideal=ideal)
         ideal, good = _culled(scene, limit_px, options)
         views = _held(views_of_scene(replace(scene, ideal=ideal), good))
-        decisive = leverages(views) > _MAX_LEVERAGE
-        if decisive.any():
-            good[np.flatnonzero(good)[decisive]] = False
+        too_strong = decisive(views)
+        if too_strong.any():
+            good[np.flatnonzero(good)[too_strong]] = False
             views = _held(views_of_scene(replace(scene, ideal=ideal), good))
         adjusted, _ = adjust(views, BundleOptions())
         points = np.full_like(points, np.nan)
@@ -89,24 +84,20 @@ def _culled(scene: Scene, limit_px: float, options: MapOptions) -> tuple[Array, 
     """Drop observations that miss; return (N, V, 2) the rest and (N,) landmarks still good."""
     used = sorted(scene.cams)
     views = views_of_scene(scene, np.ones(len(scene.points), dtype=bool))
-    error = np.linalg.norm(reprojection_residuals(views), axis=2)
+    fits, good = fitting(views, limit_px, options)
     ideal = scene.ideal.copy()
-    fits = error < limit_px
-    placed = np.isfinite(scene.points[:, 0])
+    known = np.isfinite(scene.points[:, 0])
     for column, i in enumerate(used):
         # What no two registered views see is not placed yet, and not wrong either.
-        ideal[placed & ~fits[:, column], i] = np.nan
-    cams = [scene.cams[i] for i in used]
-    angle = ray_angles(cams, np.nan_to_num(scene.points), fits)
-    good = (fits.sum(axis=1) >= 2) & (angle > np.deg2rad(options.min_angle_deg))
-    return ideal, np.asarray(good)
+        ideal[known & ~fits[:, column], i] = np.nan
+    return ideal, good
 
 
 def register_next(drones: list[DroneView], scene: Scene, options: MapOptions) -> Scene | None:
     """Register the waiting view that sees most of what is placed; None when none can be."""
-    placed = np.isfinite(scene.points[:, 0])
+    known = np.isfinite(scene.points[:, 0])
     waiting = [i for i in range(len(drones)) if i not in scene.cams]
-    common = {i: np.flatnonzero(placed & np.isfinite(scene.ideal[:, i, 0])) for i in waiting}
+    common = {i: np.flatnonzero(known & np.isfinite(scene.ideal[:, i, 0])) for i in waiting}
     for i in sorted(waiting, key=lambda i: len(common[i]), reverse=True):
         index = common[i]
         sightings = Sightings(

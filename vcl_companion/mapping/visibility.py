@@ -13,6 +13,7 @@ from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.tracks import PairMatches
 from vcl_companion.vision.essential import EssentialOptions, RelativePose, relative_poses
+from vcl_companion.vision.features import Features
 from vcl_companion.vision.matching import MatchOptions, match_mutual
 
 
@@ -77,7 +78,7 @@ def _degrees_apart(one: Pose, other: Pose) -> tuple[float, float]:
 
 def _edge(a: DroneView, b: DroneView, options: MapOptions, seed: int) -> Edge:
     """Find the relative pose of two drones' cameras, or say why not."""
-    matches = match_views(a, b)
+    matches = match_features(a.features, b.features)
     names = f"drones {a.drone_id} and {b.drone_id}"
     guess = None
     if a.ned_from_body is not None and b.ned_from_body is not None:
@@ -105,11 +106,11 @@ def _edge(a: DroneView, b: DroneView, options: MapOptions, seed: int) -> Edge:
     return Edge(agreed, chosen)
 
 
-def match_views(a: DroneView, b: DroneView) -> PairMatches:
-    """Match two images, detector by detector."""
+def match_features(a: tuple[Features, ...], b: tuple[Features, ...]) -> PairMatches:
+    """Match two images, detector by detector; indices count one detector after the other."""
     rows, columns = [], []
     start_a = start_b = 0
-    for features_a, features_b in zip(a.features, b.features, strict=True):
+    for features_a, features_b in zip(a, b, strict=True):
         i, k = match_mutual(features_a, features_b, MatchOptions())
         rows.append(i + start_a)
         columns.append(k + start_b)
