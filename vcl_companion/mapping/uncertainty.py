@@ -16,11 +16,13 @@ import numpy as np
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
-from vcl_companion.vision.bundle import Distance, Views, normal_equations, paired
+from vcl_companion.vision.bundle import Distance, Views, normal_equations
 from vcl_companion.vision.information import covariance_of
+from vcl_companion.vision.schur import eliminated
 
-# Smallest eigenvalue of an information matrix with ones on its diagonal; rounding leaves 1e-16.
-_SINGULAR = 1e-12
+# Smallest eigenvalue of an information matrix with ones on its diagonal; eliminating landmarks of little
+# parallax leaves 1e-12 by rounding.
+_SINGULAR = 1e-11
 # No distance between drones is known better; much smaller sigmas overflow.
 _FINEST_M = 1e-6
 
@@ -81,7 +83,7 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
         system = normal_equations(scaled, None)
         inverse = _inverse(system.point_block)
         lever = -np.swapaxes(system.cross @ inverse, 1, 2)
-        reduced = system.pose_block + paired(np.swapaxes(lever, 1, 2), system.cross)
+        reduced = system.pose_block - eliminated(system.cross, inverse, system.seen)
         covariance = np.zeros_like(reduced)
         covariance[6:, 6:] = _inverse(reduced[6:, 6:])
     return MapUncertainty(covariance, inverse, lever)
