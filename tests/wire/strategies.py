@@ -50,7 +50,14 @@ _revisions = st.one_of(st.just(b""), st.binary(min_size=8, max_size=8))
 
 messages = st.one_of(
     st.builds(FrameRequest, _request_ids, st.floats(0.0, 3600.0)),
-    st.builds(MapState, _revisions, st.integers(0, 32_768), st.booleans()),
+    st.builds(
+        MapState,
+        _revisions,
+        st.integers(0, 32_768),
+        st.booleans(),
+        st.integers(0, 65_535),
+        st.booleans(),
+    ),
     st.builds(MapRefused.because, _request_ids, st.text()),
 )
 

@@ -28,7 +28,8 @@ _GOLDEN: dict[str, TunnelPayload] = {
     "status_complete": TransferStatus(0xCAFE, Reply.COMPLETE, 127, digest=bytes(range(8))),
     "status_busy": TransferStatus(0xCAFE, Reply.BUSY, 1),
     "frame_request": FrameRequest(77, 0.125),
-    "map_state": MapState(bytes(range(8)), 1000, True),
+    "map_state": MapState(bytes(range(8)), 1000, True, 517, False),
+    "map_state_wants_update": MapState(bytes(range(8)), 1000, False, 0, True),
     "map_state_none": MapState(b"", 0, False),
     "map_refused": MapRefused(78, "zu wenig Überlappung"),
 }
@@ -124,6 +125,8 @@ def test_any_text_makes_a_reason(text: str, request_id: int) -> None:
         lambda: FrameRequest(1 << 32, 0.0),
         lambda: MapState(b"123", 0, True),
         lambda: MapState(b"", 1 << 20, True),
+        lambda: MapState(b"", 0, True, 1 << 16),
+        lambda: MapState(b"", 0, True, -1),
         lambda: MapRefused(1, "two\nlines"),
         lambda: MapRefused(1, ""),
         lambda: TransferStatus(1, Reply.RECEIVING, 1, 0, 10, ((5, 5),)),
