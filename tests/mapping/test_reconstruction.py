@@ -22,8 +22,9 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.landmark_map import LandmarkMap
-from vcl_companion.mapping.reconstruction import MapOptions, NoMap, choose_hypothesis, reconstruct
+from vcl_companion.mapping.reconstruction import MapOptions, NoMap, reconstruct
 from vcl_companion.mapping.uncertainty import map_uncertainty
+from vcl_companion.mapping.visibility import choose_hypothesis
 from vcl_companion.vision.essential import RelativePose
 from vcl_companion.vision.features import Features
 

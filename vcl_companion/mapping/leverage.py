@@ -8,12 +8,10 @@ test finds it. A map has to stand without such landmarks.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision.bundle import Views, linearized, normal_equations
+from vcl_companion.vision.bundle import Views, linearized, normal_equations, paired
 
 
 def leverages(views: Views) -> Array:
@@ -26,29 +24,37 @@ def leverages(views: Views) -> Array:
         views: an adjusted estimate, every landmark seen at least twice.
     """
     n, v = views.ideal.shape[:2]
-    own = np.zeros((n, 6 * v, 6 * v))
-    for i in range(v):
-        seen = np.flatnonzero(np.isfinite(views.ideal[:, i, 0]))
-        _, j_pose, _ = linearized(
-            views.bodies[i],
-            views.mountings[i],
-            views.slopes[seen, i],
-            views.points[seen],
-            views.ideal[seen, i],
-        )
-        block = slice(6 * i, 6 * i + 6)
-        own[seen, block, block] = np.einsum("nki,nkj->nij", j_pose, j_pose)
-    # Without landmarks only the distances are left.
-    no_points = replace(views, points=views.points[:0], ideal=views.ideal[:0])
-    by_distances = normal_equations(no_points, None).pose_block
     try:
         system = normal_equations(views, None)
-        inverse = np.linalg.inv(system.point_block)
-        own -= system.cross @ inverse @ np.swapaxes(system.cross, 1, 2)
-        free = slice(6, None)
-        total = (own.sum(axis=0) + by_distances)[free, free]
-        whiten = np.linalg.inv(np.linalg.cholesky(total))
-        shares = np.linalg.eigvalsh(whiten @ own[:, free, free] @ whiten.T)[:, -1]
+        coupled = system.cross @ np.linalg.inv(system.point_block)
+        total = system.pose_block - paired(coupled, system.cross)
+        covariance = np.zeros_like(total)
+        covariance[6:, 6:] = np.linalg.inv(total[6:, 6:])
+        np.linalg.cholesky(total[6:, 6:])
     except np.linalg.LinAlgError:
         return np.ones(n)
+    by_pose, by_point = np.zeros((n, v, 2, 6)), np.zeros((n, v, 2, 3))
+    seen = np.isfinite(views.ideal[:, :, 0])
+    for i in range(v):
+        j = np.flatnonzero(seen[:, i])
+        _, by_pose[j, i], by_point[j, i] = linearized(
+            views.bodies[i],
+            views.mountings[i],
+            views.slopes[j, i],
+            views.points[j],
+            views.ideal[j, i],
+        )
+    shares = np.ones(n)
+    n_seen = seen.sum(axis=1)
+    for s in np.unique(n_seen[n_seen >= 2]):
+        # Only the s views that see a landmark enter its own share: small matrices.
+        j = np.flatnonzero(n_seen == s)
+        at = np.nonzero(seen[j])[1].reshape(-1, s)
+        pose = by_pose[j[:, None], at]
+        point = by_point[j[:, None], at].reshape(-1, 2 * s, 3)
+        blocks = covariance.reshape(v, 6, v, 6)[at[:, :, None], :, at[:, None, :], :]
+        spread = np.einsum("naki,nabij,nblj->nakbl", pose, blocks, pose, optimize=True)
+        spread = spread.reshape(-1, 2 * s, 2 * s)
+        across = np.eye(2 * s) - point @ np.linalg.pinv(point)
+        shares[j] = np.linalg.eigvalsh(across @ spread @ across)[:, -1]
     return np.asarray(np.clip(np.nan_to_num(shares, nan=1.0), 0.0, 1.0))

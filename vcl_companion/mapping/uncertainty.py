@@ -16,7 +16,7 @@ import numpy as np
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
-from vcl_companion.vision.bundle import Distance, Views, normal_equations
+from vcl_companion.vision.bundle import Distance, Views, normal_equations, paired
 from vcl_companion.vision.information import covariance_of
 
 # Smallest eigenvalue of an information matrix with ones on its diagonal; rounding leaves 1e-16.
@@ -81,7 +81,7 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
         system = normal_equations(scaled, None)
         inverse = _inverse(system.point_block)
         lever = -np.swapaxes(system.cross @ inverse, 1, 2)
-        reduced = system.pose_block + np.einsum("nji,nkj->ik", lever, system.cross)
+        reduced = system.pose_block + paired(np.swapaxes(lever, 1, 2), system.cross)
         covariance = np.zeros_like(reduced)
         covariance[6:, 6:] = _inverse(reduced[6:, 6:])
     return MapUncertainty(covariance, inverse, lever)

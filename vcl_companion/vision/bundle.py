@@ -186,6 +186,14 @@ def normal_equations(views: Views, cauchy_px: float | None) -> NormalEquations:
     return NormalEquations(pose_block, pose_rhs, point_block, point_rhs, cross, cost)
 
 
+def paired(one: Array, other: Array) -> Array:
+    """Return the (K, L) sum over landmarks of (N, K, 3) times (N, L, 3) transposed."""
+    k, m = one.shape[1], other.shape[1]
+    return np.asarray(
+        one.transpose(1, 0, 2).reshape(k, -1) @ other.transpose(1, 0, 2).reshape(m, -1).T
+    )
+
+
 def linearized(
     world_from_body: Pose, body_from_cam: Pose, slopes: Array, points: Array, ideal: Array
 ) -> tuple[Array, Array, Array]:
@@ -254,7 +262,7 @@ def _solve(system: NormalEquations, damping: float) -> tuple[Array, Array] | Non
     try:
         inverse = np.linalg.inv(point_block)
         coupled = system.cross @ inverse
-        reduced = system.pose_block - np.einsum("nij,nkj->ik", coupled, system.cross)
+        reduced = system.pose_block - paired(coupled, system.cross)
         rhs = system.pose_rhs - np.einsum("nij,nj->i", coupled, system.point_rhs)
         free = slice(6, len(rhs))
         damped = reduced[free, free] + damping * np.diag(np.diag(system.pose_block)[free])

@@ -59,6 +59,12 @@ class Features:
         return Features(self.pixels[index], self.descriptors[index])
 
 
+def joined_features(parts: list[Features]) -> Features:
+    """Return the features of several images as one set, one after the other."""
+    descriptors = np.concatenate([part.descriptors for part in parts])
+    return Features(np.concatenate([part.pixels for part in parts]), descriptors)
+
+
 def detect(image: Image, detector: Detector, options: FeatureOptions) -> Features:
     """Find features in a grey image.
 

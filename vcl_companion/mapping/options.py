@@ -1,0 +1,74 @@
+"""How maps are made and when they are good enough to fly on (IV-C, IV-G)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from vcl_companion.vision.features import Detector
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """How a first map is made, and when it is good enough to fly on.
+
+    Attributes:
+        detectors: features that the map is made of; SIFT makes the better geometry
+            from far apart, and those of the localization must be among them.
+        keyframe_quality: WebP quality of exchanged images, 1 to 100.
+        min_landmarks: fewer are refused.
+        min_angle_deg: landmarks seen under a smaller angle are left out.
+        max_error_px: observations that miss by more are left out.
+        attitude_sigma_deg: how far two autopilots' relative attitude may be off, 1 sigma.
+        distance_sigma_m: how well the known distances are known, 1 sigma.
+        max_depth_error: relative depth error, 1 sigma, median over the landmarks,
+            above which the map is refused; twice that and a landmark is left out.
+        max_keyframes: an extended map keeps at most this many.
+        max_landmarks: and at most this many landmarks.
+        member_wait_s: how long a first map waits for members that are not there yet.
+        gather_timeout_s: how long it waits for the frames of those that are.
+        directory: where revisions are kept; empty for nowhere.
+    """
+
+    detectors: tuple[Detector, ...] = ("akaze", "sift")
+    keyframe_quality: int = 80
+    min_landmarks: int = 60
+    min_angle_deg: float = 1.0
+    max_error_px: float = 2.5
+    attitude_sigma_deg: float = 4.0
+    distance_sigma_m: float = 0.01
+    max_depth_error: float = 0.1
+    max_keyframes: int = 24
+    max_landmarks: int = 12_000
+    member_wait_s: float = 10.0
+    gather_timeout_s: float = 20.0
+    directory: str = ""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.keyframe_quality <= 100:
+            raise ValueError(f"keyframe_quality must lie in 1..100, got {self.keyframe_quality}")
+        if self.min_landmarks < 20:
+            raise ValueError(f"min_landmarks must be at least 20, got {self.min_landmarks}")
+        if not 4 <= self.max_keyframes <= 64:
+            raise ValueError(f"max_keyframes must lie in 4..64, got {self.max_keyframes}")
+        if not self.min_landmarks <= self.max_landmarks <= 16_000:
+            raise ValueError(
+                f"max_landmarks must lie in min_landmarks..16000, got {self.max_landmarks}"
+            )
+        for name in (
+            "min_angle_deg",
+            "max_error_px",
+            "attitude_sigma_deg",
+            "distance_sigma_m",
+            "max_depth_error",
+            "member_wait_s",
+            "gather_timeout_s",
+        ):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class NoMap:
+    """No map can be made of these views, and why."""
+
+    reason: str
