@@ -32,6 +32,7 @@ from vcl_companion.swarm.transfer import (
     TransferOptions,
     Transfers,
 )
+from vcl_companion.swarm.updates import UpdateOptions
 from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame
 from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
@@ -39,6 +40,7 @@ from vcl_companion.wire.tunnel import PayloadType, decode_payload, encode_payloa
 
 MESSAGE, DATA = PayloadType.MESSAGE, PayloadType.TRANSFER_DATA
 COMPANION = 197
+NO_UPDATES = UpdateOptions(tracked=0, share=0.0)
 FAST = TransferOptions(rate_bytes_per_s=5e6, status_interval_s=0.05)
 
 
@@ -66,8 +68,10 @@ class Drone:
         executor: ThreadPoolExecutor,
         log_path: Path,
         transfer: TransferOptions,
+        update: UpdateOptions,
         seed: int,
     ) -> None:
+        self.tracked = 0
         self.system_id = system_id
         self.autopilot, self._autopilot_link = autopilot
         self._clock = clock
@@ -80,7 +84,8 @@ class Drone:
         self.exchange = Exchange(
             system_id, Group(swarm, system_id), Transfers(transfer, rng), self.maps,
             self._autopilot_link, demo.sensor(system_id), clock, self._log, executor,
-            lambda: False, ExchangeOptions(swarm, demo.MAP_OPTIONS, demo.FEATURES, "akaze"), rng,
+            lambda: self.tracked > 0, lambda: self.tracked,
+            ExchangeOptions(swarm, demo.MAP_OPTIONS, update, demo.FEATURES, "akaze"), rng,
         )  # fmt: skip
         self._link = PeerLink(
             peers, system_id, frozenset(members), self._hear, self.exchange.on_heartbeat
@@ -216,6 +221,7 @@ class Swarm:
         system_id: int,
         flies_on: tuple[int, ...] = (),
         transfer: TransferOptions = FAST,
+        update: UpdateOptions = NO_UPDATES,
         runs: bool = True,
     ) -> Drone:
         """Start a drone at the instant of its first frame, flying on the map of some if given."""
@@ -232,7 +238,7 @@ class Swarm:
         log_path = self._path / f"{system_id}-{self._n_started}.jsonl"
         drone = Drone(
             system_id, self._members, self._peers(system_id), autopilot, clock, executor,
-            log_path, transfer, self._n_started,
+            log_path, transfer, update, self._n_started,
         )  # fmt: skip
         life.callback(drone.close)
         if flies_on:

@@ -97,7 +97,10 @@ async def _run(config: Config) -> int:
         log,
         mapping,
         lambda: companion.is_localized,
-        ExchangeOptions(config.swarm, config.map, config.features, config.localization.detector),
+        lambda: companion.tracked,
+        ExchangeOptions(
+            config.swarm, config.map, config.update, config.features, config.localization.detector
+        ),
         rng,
     )
     companion = Companion(

@@ -96,6 +96,7 @@ class Companion:
         self._options = options
         self._mailbox = Mailbox()
         self._state: FilterState | None = None
+        self._tracked = 0
         self._n_resets = 0
         self._n_contradicted = 0
         self._last_sequence: int | None = None
@@ -108,6 +109,11 @@ class Companion:
         """Whether a frame of the last two seconds gave a pose."""
         state = self._state
         return state is not None and self._clock.now_ns() - state.fixed_at_ns <= _FRESH_NS
+
+    @property
+    def tracked(self) -> int:
+        """Landmarks that agreed on the last frame's pose; 0 when it gave none."""
+        return self._tracked
 
     async def read_camera(self) -> None:
         """Move frames from the camera to the mailbox until the stream ends and all are answered.
@@ -234,6 +240,7 @@ class Companion:
         if not sent:
             self._refuse(frame, NotLocalized("the pose's covariance is not finite"))
             return
+        self._tracked = fix.n_inliers
         self._health.localized()
         self._log.frame(
             frame.sequence,
@@ -247,6 +254,7 @@ class Companion:
 
     def _refuse(self, frame: Frame, why: NotLocalized) -> None:
         """Send nothing, and say why."""
+        self._tracked = 0
         self._health.refused(why.reason)
         self._log_refused(frame, why)
 

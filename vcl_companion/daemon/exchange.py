@@ -1,4 +1,4 @@
-"""What peers say, and what is said to them: frames for a first map, and maps.
+"""What peers say, and what is said to them: frames for maps, votes for updates, and maps.
 
 What comes from peers enters here only, bounded and checked by ``wire`` and
 ``swarm``; it can replace the map and nothing else. Nothing is done for a peer
@@ -20,32 +20,34 @@ import numpy as np
 
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
-from vcl_companion.daemon.first_map import FirstMap
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_answers import FrameAnswers, WantedFrame
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.mailbox import PeerMailbox
+from vcl_companion.daemon.map_rounds import MapRounds, RoundOptions
 from vcl_companion.daemon.map_sharing import MapSharing
-from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.errors import WireError
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.mavlink import Tunnel
 from vcl_companion.links.peers import PeerLink
 from vcl_companion.mapping.landmark_map import LandmarkMap
-from vcl_companion.mapping.reconstruction import MapOptions, NoMap
+from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.group import Group, PeerJoined, PeerLost, SwarmOptions
 from vcl_companion.swarm.transfer import (
+    BlobDelivered,
     BlobKind,
     BlobReceived,
     Event,
     TransferFailed,
     Transfers,
 )
+from vcl_companion.swarm.updates import OwnVote, UpdateOptions
 from vcl_companion.vision.features import Detector, FeatureOptions
 from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.frame_codec import decode_frame
-from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
+from vcl_companion.wire.messages import MAX_TRACKED, FrameRequest, MapRefused, MapState
 from vcl_companion.wire.tunnel import TunnelPayload, decode_payload, encode_payload, is_ours
 
 _log = logging.getLogger(__name__)
@@ -60,6 +62,7 @@ class ExchangeOptions:
 
     swarm: SwarmOptions
     map: MapOptions
+    update: UpdateOptions
     features: FeatureOptions
     detector: Detector
 
@@ -78,6 +81,7 @@ class Exchange:
         log: told of maps and peers.
         executor: runs map building and indexing.
         is_localized: whether this drone flies on its map right now.
+        tracked: landmarks that agreed on its last frame's pose, 0 without a pose.
         options: of the steps.
         rng: numbers our requests.
     """
@@ -94,6 +98,7 @@ class Exchange:
         log: FlightLog,
         executor: Executor,
         is_localized: Callable[[], bool],
+        tracked: Callable[[], int],
         options: ExchangeOptions,
         rng: np.random.Generator,
     ) -> None:
@@ -105,6 +110,7 @@ class Exchange:
         self._log = log
         self._executor = executor
         self._is_localized = is_localized
+        self._tracked = tracked
         self._options = options
         self._link: PeerLink | None = None
         self._frames = FrameHistory()
@@ -112,19 +118,20 @@ class Exchange:
             system_id, self._frames, autopilot, sensor, clock, executor,
             options.map.keyframe_quality,
         )  # fmt: skip
-        self._first_map = FirstMap(
-            system_id,
+        self._rounds = MapRounds(
             group,
             self._frames,
             maps,
             self._answers.describe,
             self._send,
             self._decide,
+            lambda: transfers.is_receiving(BlobKind.MAP, self._now_s()),
+            log,
             clock,
             executor,
-            options.swarm.known_distances,
-            options.map,
-            options.features,
+            RoundOptions(
+                options.swarm.known_distances, options.map, options.update, options.features
+            ),
             rng,
         )
         self._sharing = MapSharing(
@@ -137,7 +144,10 @@ class Exchange:
             self._count,
             options.detector,
             options.features,
+            options.update.delivery_wait_s,
         )
+        self._vote = OwnVote(options.update)
+        self._wants_update = False
         self._wake = asyncio.Event()
         self._wanted: PeerMailbox[WantedFrame] = PeerMailbox()
         self._answering: dict[int, int] = {}
@@ -178,7 +188,7 @@ class Exchange:
     async def run(self) -> None:
         """Keep transfers, states and rounds going until cancelled; a failure in one ends all."""
         async with asyncio.TaskGroup() as parts:
-            parts.create_task(self._first_map.run())
+            parts.create_task(self._rounds.run())
             parts.create_task(self._answer_requests())
             parts.create_task(self._sharing.run())
             parts.create_task(self._keep_going())
@@ -188,7 +198,7 @@ class Exchange:
         while True:
             now_s = self._now_s()
             self._note(self._group.poll(now_s))
-            if now_s - told_at_s >= _STATE_INTERVAL_S:
+            if self._voted(now_s) or now_s - told_at_s >= _STATE_INTERVAL_S:
                 told_at_s = now_s
                 self._tell_state()
             self._sharing.hand_out(now_s)
@@ -224,6 +234,8 @@ class Exchange:
                     self._take_frame(peer, blob)
                 case BlobReceived(peer=peer, kind=BlobKind.MAP, blob=blob):
                     self._sharing.offer(peer, blob)
+                case BlobDelivered(peer=peer, transfer_id=transfer_id):
+                    self._sharing.delivered(peer, transfer_id)
                 case TransferFailed(peer=peer, reason=reason):
                     self._log.event("transfer", f"to drone {peer}: {reason}")
                     _log.warning("transfer to drone %d failed: %s", peer, reason)
@@ -234,7 +246,7 @@ class Exchange:
         except WireError as error:
             self._count(peer, "frame", str(error))
             return
-        if not self._first_map.take(peer, frame):
+        if not self._rounds.take(peer, frame):
             self._count(peer, "frame nobody asked for")
 
     async def _answer_requests(self) -> None:
@@ -255,21 +267,39 @@ class Exchange:
             self._answering[peer] = sent_id
             self._wake.set()
 
-    async def _decide(self, built: LandmarkMap | NoMap, request_id: int) -> None:
+    async def _decide(
+        self, built: LandmarkMap | NoMap, instead_of: StoredMap | None, request_id: int
+    ) -> None:
         """Fly on the map that we have built, or tell everybody why there is none."""
         if isinstance(built, LandmarkMap):
-            refused = await self._sharing.adopt(built)
+            refused = await self._sharing.adopt(built, instead_of)
             if refused is None:
                 return
             built = refused
-        reason = built.reason
-        refusal = MapRefused.because(request_id, reason)
+        refusal = MapRefused.because(request_id, built.reason)
         for peer in self._group.peers:
             self._send(refusal, peer)
+        self._no_map(built.reason)
+
+    def _no_map(self, reason: str) -> None:
+        """Note that a round gave no map; the one in use stays, if there is one."""
+        if self._maps.current is not None:
+            self._log.event("no update", reason)
+            _log.warning("no update of the map: %s", reason)
+            return
         if reason != self._maps.refusal:
             self._log.event("no map", reason)
             _log.warning("no map: %s", reason)
         self._maps.refuse(reason)
+
+    def _voted(self, now_s: float) -> bool:
+        """Look at what we see of the map; whether our vote for an update has changed."""
+        stored = self._maps.current
+        before = self._wants_update
+        self._wants_update = self._vote.look(
+            stored.revision if stored else b"", self._tracked(), now_s
+        )
+        return self._wants_update != before
 
     def _tell_state(self) -> None:
         stored = self._maps.current
@@ -277,6 +307,8 @@ class Exchange:
             stored.revision if stored else b"",
             stored.n_landmarks if stored else 0,
             self._is_localized(),
+            min(self._tracked(), MAX_TRACKED),
+            self._wants_update,
         )
         self._group.set_own_state(state)
         self._send(state, 0)
