@@ -24,10 +24,11 @@ from vcl_companion.links.autopilot import AutopilotOptions
 from vcl_companion.links.peers import PeerOptions
 from vcl_companion.localization.intra import LocalizationOptions
 from vcl_companion.localization.pose_filter import FilterOptions
-from vcl_companion.mapping.reconstruction import MapOptions
+from vcl_companion.mapping.options import MapOptions
 from vcl_companion.swarm.group import SwarmOptions
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.swarm.transfer_options import TransferOptions
+from vcl_companion.swarm.updates import UpdateOptions
 from vcl_companion.vision.features import FeatureOptions
 
 _Section = TypeVar("_Section")
@@ -67,6 +68,7 @@ class Config:
     swarm: SwarmOptions = field(default_factory=SwarmOptions)
     transfer: TransferOptions = field(default_factory=TransferOptions)
     map: MapOptions = field(default_factory=MapOptions)
+    update: UpdateOptions = field(default_factory=UpdateOptions)
     features: FeatureOptions = field(default_factory=FeatureOptions)
     localization: LocalizationOptions = field(default_factory=LocalizationOptions)
     filter: FilterOptions = field(default_factory=FilterOptions)

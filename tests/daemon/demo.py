@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vcl_companion.cameras.source import Frame
-from vcl_companion.daemon.first_map import Distances, build_map
+from vcl_companion.daemon.map_building import Distances, build_map
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.localization.map_index import MapIndex, index_map

@@ -36,6 +36,7 @@ from vcl_companion.swarm.transfer import (
     TransferOptions,
     Transfers,
 )
+from vcl_companion.swarm.updates import UpdateOptions
 from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame
 from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
@@ -46,6 +47,7 @@ Message = FrameRequest | MapState | MapRefused | PoseProposal | PoseRefused
 MESSAGE, DATA = PayloadType.MESSAGE, PayloadType.TRANSFER_DATA
 COMPANION = 197
 INTER = InterMavOptions(detector="akaze")
+NO_UPDATES = UpdateOptions(tracked=0, share=0.0)
 FAST = TransferOptions(rate_bytes_per_s=5e6, status_interval_s=0.05)
 
 
@@ -74,6 +76,7 @@ class Drone:
         log_path: Path,
         transfer: TransferOptions,
         inter: InterMavOptions,
+        update: UpdateOptions,
         seed: int,
     ) -> None:
         self.system_id = system_id
@@ -92,7 +95,7 @@ class Drone:
             system_id, Group(swarm, system_id), Transfers(transfer, rng), self.maps,
             self._autopilot_link, demo.sensor(system_id), clock, self._log, executor,
             self.estimator,
-            ExchangeOptions(swarm, demo.MAP_OPTIONS, demo.FEATURES, "akaze", inter), rng,
+            ExchangeOptions(swarm, demo.MAP_OPTIONS, update, demo.FEATURES, "akaze", inter), rng,
         )  # fmt: skip
         self._link = PeerLink(
             peers, system_id, frozenset(members), self._hear, self.exchange.on_heartbeat
@@ -229,6 +232,7 @@ class Swarm:
         flies_on: tuple[int, ...] = (),
         transfer: TransferOptions = FAST,
         inter: InterMavOptions = INTER,
+        update: UpdateOptions = NO_UPDATES,
         runs: bool = True,
     ) -> Drone:
         """Start a drone at the instant of its first frame, flying on the map of some if given."""
@@ -245,7 +249,7 @@ class Swarm:
         log_path = self._path / f"{system_id}-{self._n_started}.jsonl"
         drone = Drone(
             system_id, self._members, self._peers(system_id), autopilot, clock, executor,
-            log_path, transfer, inter, self._n_started,
+            log_path, transfer, inter, update, self._n_started,
         )  # fmt: skip
         life.callback(drone.close)
         if flies_on:

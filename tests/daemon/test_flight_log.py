@@ -42,7 +42,7 @@ def test_lines_are_as_specified(tmp_path: Path) -> None:
     fill(log)
     clock.advance_to(42)
     log.event("lost", "fog \u2601")
-    log.map(bytes(range(8)), 120, 4567, 3)
+    log.map(bytes(range(8)), b"", 120, 4567, 3)
     before_the_end = lines(path)
     log.close(**SUMMARY)
     assert lines(path)[:-1] == before_the_end == [
@@ -55,8 +55,8 @@ def test_lines_are_as_specified(tmp_path: Path) -> None:
         {"kind": "frame", "sequence": 3, "captured_at_ns": 400, "outcome": "refused",
          "reason": "fog", "latency_ms": 9.0, "matched": 0, "inliers": 0},
         {"kind": "event", "at_ns": 42, "event": "lost", "reason": "fog \u2601"},
-        {"kind": "map", "at_ns": 42, "revision": "0001020304050607", "landmarks": 120,
-         "bytes": 4567, "keyframes": 3},
+        {"kind": "map", "at_ns": 42, "revision": "0001020304050607", "parent": "",
+         "landmarks": 120, "bytes": 4567, "keyframes": 3},
     ]  # fmt: skip
     assert lines(path)[-1] == {
         "kind": "summary",

@@ -258,6 +258,33 @@ def test_a_cancelled_transfer_sends_no_more_and_says_nothing() -> None:
     assert network.ends() == []
 
 
+def test_what_was_of_no_use_can_be_sent_again_but_not_at_once() -> None:
+    network = two_drones()
+    send(network, BLOB)
+    network.drones[2].forget(1, MAP, BLOB, network.now_s + 5.0)
+    send(network, BLOB)  # too early: it is told that the blob is there
+    assert network.blobs(2) == [BLOB]
+    network.now_s += 5.0
+    network.log.clear()
+    send(network, BLOB)
+    assert network.blobs(2) == [BLOB]
+    assert len(network.ends()) == 1
+    network.drones[2].forget(1, MAP, BLOB[1:], 0.0)  # one that never came
+
+
+def test_what_is_coming_in_is_known_by_its_kind() -> None:
+    network = two_drones(options=TransferOptions(rate_bytes_per_s=1000.0, burst_bytes=128))
+    two = network.drones[2]
+    network.drones[1].submit(2, MAP, BLOB, network.now_s)
+    assert not two.is_receiving(MAP, network.now_s)
+    network.run(network.now_s + 5.0)
+    assert two.is_receiving(MAP, network.now_s)
+    assert not two.is_receiving(BlobKind.FRAME_ANSWER, network.now_s)
+    assert not two.is_receiving(MAP, network.now_s + network.options.give_up_s)
+    network.run(network.now_s + 100.0, stop=lambda: bool(network.ends()))
+    assert not two.is_receiving(MAP, network.now_s)
+
+
 def test_it_is_deterministic() -> None:
     weather = Weather(loss=0.3, duplicates=0.1, corrupt=0.001, jitter_s=0.05)
     runs = []

@@ -66,7 +66,14 @@ def proposals(draw: st.DrawFn) -> PoseProposal:
 
 messages = st.one_of(
     st.builds(FrameRequest, _request_ids, st.floats(0.0, 3600.0)),
-    st.builds(MapState, _revisions, st.integers(0, 32_768), st.booleans()),
+    st.builds(
+        MapState,
+        _revisions,
+        st.integers(0, 32_768),
+        st.booleans(),
+        st.integers(0, 65_535),
+        st.booleans(),
+    ),
     st.builds(MapRefused.because, _request_ids, st.text()),
     proposals(),
     st.builds(PoseRefused.because, _request_ids, st.text()),

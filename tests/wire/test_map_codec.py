@@ -19,7 +19,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.mapping.landmark_map import KnownDistance, LandmarkMap
 from vcl_companion.wire.frame_codec import decode_frame
 from vcl_companion.wire.header import PROTOCOL_VERSION, BlobKind, VersionMismatchError
-from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
+from vcl_companion.wire.map_codec import decode_map, encode_map, parent_of, revision_of
 
 _maps = st.builds(
     random_map,
@@ -183,3 +183,18 @@ def test_the_codec_carries_every_field_of_a_map() -> None:
         "distances",
         "parent",
     }
+
+
+@given(st.one_of(st.just(b""), st.binary(min_size=8, max_size=8)))
+def test_the_parent_is_read_without_the_rest(parent: bytes) -> None:
+    data = encode_map(replace(small_map(), parent=parent))
+    assert parent_of(data) == parent_of(data[:40]) == decode_map(data).parent == parent
+
+
+@given(st.binary(max_size=60), st.sampled_from([b"", b"\x01", b"\x01\x42"]))
+def test_of_any_bytes_a_parent_or_a_wire_error(body: bytes, head: bytes) -> None:
+    try:
+        parent = parent_of(head + body)
+    except WireError:
+        return
+    assert len(parent) in (0, 8)

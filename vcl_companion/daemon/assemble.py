@@ -113,6 +113,7 @@ async def _run(config: Config) -> int:
         ExchangeOptions(
             config.swarm,
             config.map,
+            config.update,
             config.features,
             config.localization.detector,
             config.inter,

@@ -1,4 +1,4 @@
-"""What peers say, and what is said to them: frames for a first map, maps, and poses.
+"""What peers say, and what is said to them: frames and votes for maps, maps, and poses.
 
 What comes from peers enters here only, bounded and checked by ``wire`` and
 ``swarm``; it can replace the map, propose a pose, and nothing else. Nothing is done for a peer
@@ -19,36 +19,38 @@ import numpy as np
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
 from vcl_companion.daemon.estimator import Estimator
-from vcl_companion.daemon.first_map import FirstMap
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_answers import FrameAnswers, WantedFrame
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.inter_host import InterHost
 from vcl_companion.daemon.inter_target import InterTarget
 from vcl_companion.daemon.mailbox import PeerMailbox
+from vcl_companion.daemon.map_rounds import MapRounds, RoundOptions
 from vcl_companion.daemon.map_sharing import MapSharing
-from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.refusals import Refusals
 from vcl_companion.errors import WireError
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.mavlink import Tunnel
 from vcl_companion.links.peers import PeerLink
 from vcl_companion.mapping.landmark_map import LandmarkMap
-from vcl_companion.mapping.reconstruction import MapOptions, NoMap
+from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.group import Group, PeerJoined, PeerLost, SwarmOptions
 from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
 from vcl_companion.swarm.transfer import (
+    BlobDelivered,
     BlobKind,
     BlobReceived,
     Event,
     TransferFailed,
     Transfers,
 )
+from vcl_companion.swarm.updates import OwnVote, UpdateOptions
 from vcl_companion.vision.features import Detector, FeatureOptions
 from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.frame_codec import decode_frame
-from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
+from vcl_companion.wire.messages import MAX_TRACKED, FrameRequest, MapRefused, MapState
 from vcl_companion.wire.pose_messages import PoseProposal, PoseRefused
 from vcl_companion.wire.tunnel import TunnelPayload, decode_payload, encode_payload, is_ours
 
@@ -64,6 +66,7 @@ class ExchangeOptions:
 
     swarm: SwarmOptions
     map: MapOptions
+    update: UpdateOptions
     features: FeatureOptions
     detector: Detector
     inter: InterMavOptions
@@ -118,19 +121,20 @@ class Exchange:
             system_id, self._frames, autopilot, sensor, clock, executor,
             options.map.keyframe_quality,
         )  # fmt: skip
-        self._first_map = FirstMap(
-            system_id,
+        self._rounds = MapRounds(
             group,
             self._frames,
             maps,
             self._answers.describe,
             self._send,
             self._decide,
+            lambda: transfers.is_receiving(BlobKind.MAP, self._now_s()),
+            log,
             clock,
             executor,
-            options.swarm.known_distances,
-            options.map,
-            options.features,
+            RoundOptions(
+                options.swarm.known_distances, options.map, options.update, options.features
+            ),
             rng,
         )
         self._sharing = MapSharing(
@@ -143,6 +147,7 @@ class Exchange:
             self._refusals.count,
             options.detector,
             options.features,
+            options.update.delivery_wait_s,
         )
         self.inter = InterTarget(
             system_id,
@@ -167,6 +172,8 @@ class Exchange:
             options.features,
             options.inter,
         )
+        self._vote = OwnVote(options.update)
+        self._wants_update = False
         self._wake = asyncio.Event()
         self._wanted: PeerMailbox[WantedFrame] = PeerMailbox()
         self._answering: dict[int, int] = {}
@@ -203,7 +210,7 @@ class Exchange:
     async def run(self) -> None:
         """Keep transfers, states and rounds going until cancelled; a failure in one ends all."""
         async with asyncio.TaskGroup() as parts:
-            parts.create_task(self._first_map.run())
+            parts.create_task(self._rounds.run())
             parts.create_task(self._answer_requests())
             parts.create_task(self._sharing.run())
             parts.create_task(self._inter_host.run())
@@ -214,7 +221,7 @@ class Exchange:
         while True:
             now_s = self._now_s()
             self._note(self._group.poll(now_s))
-            if now_s - told_at_s >= _STATE_INTERVAL_S:
+            if self._voted(now_s) or now_s - told_at_s >= _STATE_INTERVAL_S:
                 told_at_s = now_s
                 self._tell_state()
             self._sharing.hand_out(now_s)
@@ -255,6 +262,8 @@ class Exchange:
                     self._sharing.offer(peer, blob)
                 case BlobReceived(peer=peer, kind=BlobKind.POSE_REQUEST, blob=blob):
                     self._inter_host.offer(peer, blob)
+                case BlobDelivered(peer=peer, transfer_id=transfer_id):
+                    self._sharing.delivered(peer, transfer_id)
                 case TransferFailed(peer=peer, reason=reason):
                     self._log.event("transfer", f"to drone {peer}: {reason}")
                     _log.warning("transfer to drone %d failed: %s", peer, reason)
@@ -265,7 +274,7 @@ class Exchange:
         except WireError as error:
             self._refusals.count(peer, "frame", str(error))
             return
-        if not self._first_map.take(peer, frame):
+        if not self._rounds.take(peer, frame):
             self._refusals.count(peer, "frame nobody asked for")
 
     async def _answer_requests(self) -> None:
@@ -286,17 +295,26 @@ class Exchange:
             self._answering[peer] = sent_id
             self._wake.set()
 
-    async def _decide(self, built: LandmarkMap | NoMap, request_id: int) -> None:
+    async def _decide(
+        self, built: LandmarkMap | NoMap, instead_of: StoredMap | None, request_id: int
+    ) -> None:
         """Fly on the map that we have built, or tell everybody why there is none."""
         if isinstance(built, LandmarkMap):
-            refused = await self._sharing.adopt(built)
+            refused = await self._sharing.adopt(built, instead_of)
             if refused is None:
                 return
             built = refused
-        reason = built.reason
-        refusal = MapRefused.because(request_id, reason)
+        refusal = MapRefused.because(request_id, built.reason)
         for peer in self._group.peers:
             self._send(refusal, peer)
+        self._no_map(built.reason)
+
+    def _no_map(self, reason: str) -> None:
+        """Note that a round gave no map; the one in use stays, if there is one."""
+        if self._maps.current is not None:
+            self._log.event("no update", reason)
+            _log.warning("no update of the map: %s", reason)
+            return
         if reason != self._maps.refusal:
             self._log.event("no map", reason)
             _log.warning("no map: %s", reason)
@@ -306,12 +324,23 @@ class Exchange:
         self._wake.set()
         return self._transfers.submit(peer, BlobKind.POSE_REQUEST, blob, self._now_s())
 
+    def _voted(self, now_s: float) -> bool:
+        """Look at what we see of the map; whether our vote for an update has changed."""
+        stored = self._maps.current
+        before = self._wants_update
+        self._wants_update = self._vote.look(
+            stored.revision if stored else b"", self._estimator.tracked, now_s
+        )
+        return self._wants_update != before
+
     def _tell_state(self) -> None:
         stored = self._maps.current
         state = MapState(
             stored.revision if stored else b"",
             stored.n_landmarks if stored else 0,
             self._estimator.is_localized(self._clock.now_ns()),
+            min(self._estimator.tracked, MAX_TRACKED),
+            self._wants_update,
         )
         self._group.set_own_state(state)
         self._send(state, 0)

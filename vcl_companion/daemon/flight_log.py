@@ -122,12 +122,15 @@ class FlightLog:
         """Write something that changed."""
         self._write(kind="event", at_ns=self._clock.now_ns(), event=event, reason=reason)
 
-    def map(self, revision: bytes, n_landmarks: int, n_bytes: int, n_keyframes: int) -> None:
+    def map(
+        self, revision: bytes, parent: bytes, n_landmarks: int, n_bytes: int, n_keyframes: int
+    ) -> None:
         """Write that another map is flown on."""
         self._write(
             kind="map",
             at_ns=self._clock.now_ns(),
             revision=revision.hex(),
+            parent=parent.hex(),
             landmarks=n_landmarks,
             bytes=n_bytes,
             keyframes=n_keyframes,

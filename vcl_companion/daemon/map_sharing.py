@@ -1,7 +1,8 @@
 """Maps between peers: taken in from those who may give one, handed to those who lack it.
 
-The coordinator hands its map to everybody. One without a map (it is back, or
-late) is handed that of the first holder instead of building another.
+The coordinator hands its map to everybody, each new revision in the place of
+the last. A coordinator without a map (it is back, or late), or with one that
+the others have left (it was away), is handed that of the first holder.
 """
 
 from __future__ import annotations
@@ -10,33 +11,44 @@ import asyncio
 import logging
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.mailbox import PeerMailbox
-from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.errors import WireError
 from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.mapping.landmark_map import LandmarkMap
-from vcl_companion.mapping.reconstruction import NoMap
+from vcl_companion.mapping.options import NoMap
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.transfer import BlobKind, Transfers
 from vcl_companion.vision.features import Detector, FeatureOptions
-from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
+from vcl_companion.wire.map_codec import decode_map, encode_map, parent_of, revision_of
 
 _log = logging.getLogger(__name__)
 
 # A peer needs this long to take a map in and to say so; a failed transfer begins anew.
 _HAND_AGAIN_S = 10.0
+# What was delivered in vain is not likely to be of use the next time: ever more rarely.
+_HAND_AGAIN_AT_MOST_S = 120.0
+# A map that was refused may come again after this: we may know better by then.
+_LOOK_AGAIN_S = 5.0
 
 
 @dataclass(frozen=True)
 class _Handed:
-    """A map that was handed to a peer."""
+    """A map that was handed to a peer, and how often it arrived there."""
 
     revision: bytes
     at_s: float
     transfer_id: int
+    n_delivered: int
+
+    @property
+    def again_at_s(self) -> float:
+        """When it is handed again if the peer does not fly on it by then."""
+        wait_s = _HAND_AGAIN_S * 2.0 ** max(self.n_delivered - 1, 0)
+        return self.at_s + min(wait_s, _HAND_AGAIN_AT_MOST_S)
 
 
 class MapSharing:
@@ -52,6 +64,8 @@ class MapSharing:
         refuse: counts what a peer sent in vain: peer, kind, detail.
         detector: the localization's own.
         features: how they are found.
+        delivery_wait_s: how long a coordinator that is back with a map which we
+            have left may take to be brought up to date; then it has its way.
     """
 
     def __init__(
@@ -65,6 +79,7 @@ class MapSharing:
         refuse: Callable[[int, str, str], None],
         detector: Detector,
         features: FeatureOptions,
+        delivery_wait_s: float,
     ) -> None:
         self._group = group
         self._transfers = transfers
@@ -75,8 +90,10 @@ class MapSharing:
         self._refuse = refuse
         self._detector: Detector = detector
         self._features = features
+        self._delivery_wait_s = delivery_wait_s
         self._offered: PeerMailbox[bytes] = PeerMailbox()
         self._handed: dict[int, _Handed] = {}
+        self._behind_since_s: float | None = None  # the coordinator, as far as known
 
     def offer(self, peer: int, data: bytes) -> None:
         """Take a peer's encoded map; looked at when its turn comes."""
@@ -86,6 +103,12 @@ class MapSharing:
         """Note that a peer may have lost the map it was handed: it was restarted, or away."""
         self._handed.pop(peer, None)
 
+    def delivered(self, peer: int, transfer_id: int) -> None:
+        """Note that a blob has reached a peer."""
+        handed = self._handed.get(peer)
+        if handed is not None and handed.transfer_id == transfer_id:
+            self._handed[peer] = replace(handed, n_delivered=handed.n_delivered + 1)
+
     async def run(self) -> None:
         """Take in what peers offer, one map after the other, until cancelled."""
         while True:
@@ -94,17 +117,24 @@ class MapSharing:
             if current is not None and current.revision == revision_of(data):
                 self._tell_state()  # it did not know that we have it
                 continue
-            if not self._may_replace(peer):
-                self._refuse(peer, "map, but not from the coordinator", "")
-                continue
-            index = await self._prepared(data)
-            if isinstance(index, NoMap):
-                self._refuse(peer, "map", index.reason)
-            elif self._may_replace(peer):  # still: preparing took a while
-                await self._install(data, index)
+            why_not = self._why_not(peer, data)
+            if why_not is None:
+                index = await self._prepared(data)
+                if isinstance(index, NoMap):
+                    self._reject(peer, data, "map", index.reason)
+                    continue
+                why_not = self._why_not(peer, data)  # again: preparing took a while
+                if why_not is None:
+                    await self._install(data, index)
+                    continue
+            self._reject(peer, data, why_not)
 
-    async def adopt(self, built: LandmarkMap) -> NoMap | None:
-        """Fly on a first map of our own, exactly as peers will decode it.
+    async def adopt(self, built: LandmarkMap, instead_of: StoredMap | None) -> NoMap | None:
+        """Fly on a map of our own, exactly as peers will decode it.
+
+        Args:
+            built: a first map, or a revision of the one in use.
+            instead_of: the map in use when it was begun; None for a first map.
 
         Returns:
             None, or why it cannot be used. A map that came meanwhile stays.
@@ -117,7 +147,7 @@ class MapSharing:
         index = await self._prepared(data)
         if isinstance(index, NoMap):
             return index
-        if self._maps.current is None:
+        if self._maps.current is instead_of:
             await self._install(data, index)
         return None
 
@@ -126,27 +156,65 @@ class MapSharing:
         stored = self._maps.current
         if stored is None:
             return
+        if not self._coordinator_is_behind():
+            self._behind_since_s = None
+        elif self._behind_since_s is None:
+            self._behind_since_s = now_s
         for peer in self._lacking(stored.revision):
             last = self._handed.get(peer)
+            n_delivered = 0
             if last is not None and last.revision != stored.revision:
                 self._transfers.cancel(last.transfer_id)
-            elif last is not None and now_s - last.at_s < _HAND_AGAIN_S:
-                continue
+            elif last is not None:
+                if now_s < last.again_at_s:
+                    continue
+                n_delivered = last.n_delivered
             sent_id = self._transfers.submit(peer, BlobKind.MAP, stored.data, now_s)
-            self._handed[peer] = _Handed(stored.revision, now_s, sent_id)
+            self._handed[peer] = _Handed(stored.revision, now_s, sent_id, n_delivered)
 
     def _lacking(self, revision: bytes) -> list[int]:
         group = self._group
         if group.is_coordinator:
             return [peer for peer in group.lacking() if peer != group.own_id]
-        if group.newest_revision or group.state_of(group.coordinator) is None:
+        state = group.state_of(group.coordinator)
+        if state is None or (state.revision and not self._coordinator_is_behind()):
             return []
         is_first_holder = group.holders(revision)[:1] == (group.own_id,)
         return [group.coordinator] if is_first_holder else []
 
-    def _may_replace(self, peer: int) -> bool:
-        """Whether we fly on a peer's map: the coordinator's, or anybody's while we have none."""
-        return peer == self._group.coordinator or self._maps.current is None
+    def _coordinator_is_behind(self) -> bool:
+        """Whether somebody else coordinates, and flies on a map that we have left."""
+        state = self._group.state_of(self._group.coordinator)
+        is_other = not self._group.is_coordinator
+        return is_other and state is not None and self._maps.has_left(state.revision)
+
+    def _why_not(self, peer: int, data: bytes) -> str | None:
+        """Return why we do not fly on a peer's map, or None if we do.
+
+        Anybody's is taken while we have none, later only the coordinator's. The
+        coordinator itself takes one that goes on from its own, or that most fly on.
+        """
+        group, current = self._group, self._maps.current
+        if current is None:
+            return None
+        if group.is_coordinator:
+            holders = group.holders(revision_of(data))
+            if 2 * len(holders) > len(group.alive) or _goes_on_from(current.revision, data):
+                return None
+        if peer != group.coordinator:
+            return "map, but not from the coordinator"
+        since_s = self._behind_since_s
+        now_s = asyncio.get_running_loop().time()
+        has_its_way = since_s is not None and now_s >= since_s + self._delivery_wait_s
+        if self._maps.has_left(revision_of(data)) and not has_its_way:
+            return "map that was left"
+        return None
+
+    def _reject(self, peer: int, data: bytes, kind: str, detail: str = "") -> None:
+        """Count a map that is not taken; when it comes again it is looked at again."""
+        self._refuse(peer, kind, detail)
+        again_at_s = asyncio.get_running_loop().time() + _LOOK_AGAIN_S
+        self._transfers.forget(peer, BlobKind.MAP, data, again_at_s)
 
     async def _prepared(self, data: bytes) -> MapIndex | NoMap:
         """Make a map ready for use, beside the event loop; or say why it cannot be used."""
@@ -167,8 +235,16 @@ class MapSharing:
     async def _install(self, data: bytes, index: MapIndex) -> None:
         stored = self._maps.replace(data, index)
         n_keyframes = len(index.landmark_map.keyframes)
-        self._log.map(stored.revision, stored.n_landmarks, len(data), n_keyframes)
+        self._log.map(stored.revision, stored.parent, stored.n_landmarks, len(data), n_keyframes)
         self._log.event("map", f"{stored.n_landmarks} landmarks in {n_keyframes} keyframes")
         _log.info("map %s: %d landmarks", stored.revision.hex(), stored.n_landmarks)
         self._tell_state()
         await asyncio.get_running_loop().run_in_executor(self._executor, self._maps.keep, stored)
+
+
+def _goes_on_from(revision: bytes, data: bytes) -> bool:
+    """Whether an encoded map was made from a revision."""
+    try:
+        return parent_of(data) == revision
+    except WireError:
+        return False

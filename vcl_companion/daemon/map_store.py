@@ -6,6 +6,7 @@ import asyncio
 import logging
 import os
 import tempfile
+from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,8 @@ from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.wire.map_codec import revision_of
 
 _log = logging.getLogger(__name__)
+
+_MAX_LEFT = 256  # revisions remembered by name
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +35,11 @@ class StoredMap:
     index: MapIndex
 
     @property
+    def parent(self) -> bytes:
+        """The revision that it was made from; empty for a first map."""
+        return self.index.landmark_map.parent
+
+    @property
     def n_landmarks(self) -> int:
         """Number of landmarks."""
         return len(self.index.landmark_map.points_world)
@@ -39,6 +47,9 @@ class StoredMap:
 
 class MapStore:
     """Holds the current revision, and tells those who wait for one.
+
+    A revision stays in use until the next one is ready for use; the ones that
+    were left are known by name.
 
     Args:
         directory: where every revision is kept as ``<revision>.vclmap``; empty for nowhere.
@@ -51,6 +62,7 @@ class MapStore:
         self.current: StoredMap | None = None
         self.refusal = ""
         self._directory = Path(directory) if directory else None
+        self._left: deque[bytes] = deque(maxlen=_MAX_LEFT)
         self._decided = asyncio.Event()
         if self._directory is not None:
             try:
@@ -65,10 +77,19 @@ class MapStore:
     def replace(self, data: bytes, index: MapIndex) -> StoredMap:
         """Fly on this map from the next frame on."""
         stored = StoredMap(revision_of(data), data, index)
+        if self.current is not None and self.current.revision != stored.revision:
+            self._left.append(self.current.revision)
         self.current = stored
         self.refusal = ""
         self._decided.set()
         return stored
+
+    def has_left(self, revision: bytes) -> bool:
+        """Whether a revision was in use here, or is the one that ours was made from."""
+        current = self.current
+        if current is None or not revision or current.revision == revision:
+            return False
+        return revision in self._left or revision == current.parent
 
     def refuse(self, reason: str) -> None:
         """Let those who wait for a first map know that there is none this time, and why."""

@@ -1,4 +1,4 @@
-"""Who is in the group, who is alive, who coordinates, who has which map.
+"""Who is in the group, who is alive, who coordinates, who has which map, who wants it updated.
 
 The leader is named by the configuration (the lowest member id unless it says
 otherwise): its body at the first map is the world's origin. The coordinator is
@@ -161,6 +161,22 @@ class Group:
             return ()
         holders = self.holders(self.newest_revision)
         return tuple(member for member in self.alive if member not in holders)
+
+    @property
+    def wanting_update(self) -> tuple[int, ...]:
+        """Members alive whose vote is for an update of the newest revision (IV-G).
+
+        The vote of one that still flies on another revision is about that one,
+        and does not count.
+        """
+        if not self.newest_revision:
+            return ()
+        return tuple(m for m in self.holders(self.newest_revision) if self._states[m].wants_update)
+
+    @property
+    def majority_wants_update(self) -> bool:
+        """Whether more than half of the members alive vote for an update."""
+        return 2 * len(self.wanting_update) > len(self.alive)
 
     def poll(self, now_s: float) -> list[GroupEvent]:
         """Return who is lost by now, and forget what it had: it may come back without it."""

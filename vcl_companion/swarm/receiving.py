@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from vcl_companion.errors import WireError
 from vcl_companion.swarm.reassembly import CHUNK_COST_BYTES, FIXED_COST_BYTES, Incoming
@@ -72,7 +72,7 @@ class _Settled:
 
     reply: Reply
     digest: bytes
-    at_s: float
+    until_s: float  # remembered for so long
 
 
 class Receptions:
@@ -93,7 +93,7 @@ class Receptions:
         """Take in a chunk; return what ended by it."""
         key = (peer, chunk.tag)
         settled = self._settled.get(key)
-        if settled is not None and now_s - settled.at_s < self._options.keep_partial_s:
+        if settled is not None and now_s < settled.until_s:
             if chunk.ask:
                 self._owe(key, _Answer(now_s, now_s, chunk.ask))
             return []
@@ -107,6 +107,22 @@ class Receptions:
         else:
             self._note_ask(key, chunk, now_s)
         return events
+
+    def forget(self, peer: int, tag: int, at_s: float) -> None:
+        """Remember only until then that a blob has come: it may be of use later."""
+        settled = self._settled.get((peer, tag))
+        if settled is not None:
+            until_s = min(settled.until_s, at_s)
+            self._settled[peer, tag] = replace(settled, until_s=until_s)
+
+    def is_receiving(self, kind: BlobKind, now_s: float) -> bool:
+        """Whether an unfinished blob of a kind was heard of within the give-up time."""
+        return any(
+            incoming.descriptor is not None
+            and incoming.descriptor.kind == kind
+            and now_s - incoming.heard_at_s < self._options.give_up_s
+            for incoming in self._incoming.values()
+        )
 
     def answers(self, now_s: float) -> list[tuple[int, TransferStatus]]:
         """Return the (peer, status) that are due; what is returned counts as sent."""
@@ -193,7 +209,8 @@ class Receptions:
         """Hand out a whole blob, or begin it again if its hash is wrong."""
         blob = descriptor.blob_of(incoming.stream)
         if blob is not None:
-            self._settle(key, _Settled(Reply.COMPLETE, descriptor.short_digest, now_s))
+            until_s = now_s + self._options.keep_partial_s
+            self._settle(key, _Settled(Reply.COMPLETE, descriptor.short_digest, until_s))
             events.append(BlobReceived(key[0], descriptor.kind, blob))
             return
         incoming.begin_again()
@@ -240,7 +257,7 @@ class Receptions:
     def _refuse(self, key: _Key, reply: Reply, reason: str, now_s: float) -> ReceptionAbandoned:
         """Drop an unfinished blob and tell its sender not to go on."""
         event = self._abandon(key, reason)
-        self._settle(key, _Settled(reply, b"", now_s))
+        self._settle(key, _Settled(reply, b"", now_s + self._options.keep_partial_s))
         return event
 
     def _settle(self, key: _Key, settled: _Settled) -> None:

@@ -89,6 +89,17 @@ class Transfers:
         """Stop sending a blob, without an event; an id that is over already is fine."""
         self._sendings.pop(transfer_id, None)
 
+    def forget(self, peer: int, kind: BlobKind, blob: bytes, at_s: float) -> None:
+        """Take a blob that was received in vain as never received: it may be sent again.
+
+        Not before ``at_s``: its sender, told at once, would begin again at once.
+        """
+        self._receptions.forget(peer, describe(kind, blob).tag, at_s)
+
+    def is_receiving(self, kind: BlobKind, now_s: float) -> bool:
+        """Whether an unfinished blob of a kind has been coming in lately, from anybody."""
+        return self._receptions.is_receiving(kind, now_s)
+
     def receive(self, peer: int, message: Chunk | TransferStatus, now_s: float) -> list[Event]:
         """Take in what a peer sent; ask ``next_poll_s`` again after it."""
         if isinstance(message, Chunk):

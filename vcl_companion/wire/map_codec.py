@@ -77,6 +77,19 @@ def revision_of(data: bytes) -> bytes:
     return hashlib.sha256(data).digest()[:REVISION_BYTES]
 
 
+def parent_of(data: bytes) -> bytes:
+    """Return the revision that an encoded map was made from; empty for a first map.
+
+    Raises:
+        WireError: the bytes do not begin like a map; what follows is not looked at.
+    """
+    kind = decode_header(data)
+    if kind != BlobKind.MAP:
+        raise WireError(f"not a map: blob kind {kind}")
+    _, n_parent, _, _, _, _, parent = Reader(data, "map", HEADER_BYTES).unpack(_HEAD)
+    return _checked_parent(n_parent, parent)
+
+
 def encode_map(landmark_map: LandmarkMap) -> bytes:
     """Return the bytes of a map; points and pixels are rounded to their grids.
 
@@ -140,8 +153,7 @@ def decode_map(data: bytes) -> LandmarkMap:
     )
     if not 0 < detectors < 1 << len(_DETECTORS):
         raise WireError(f"map: unknown detectors {detectors:#x}")
-    if n_parent not in (0, REVISION_BYTES) or parent[n_parent:].strip(b"\0"):
-        raise WireError("map: malformed parent revision")
+    parent = _checked_parent(n_parent, parent)
     try:
         _check_counts(n_landmarks, n_keyframes, n_distances)
         distances = tuple(KnownDistance(*reader.unpack(_DISTANCE)) for _ in range(n_distances))
@@ -162,10 +174,17 @@ def decode_map(data: bytes) -> LandmarkMap:
             pixel_noise_px=noise_px,
             detectors=tuple(n for bit, n in enumerate(_DETECTORS) if detectors >> bit & 1),
             distances=distances,
-            parent=parent[:n_parent],
+            parent=parent,
         )
     except ValueError as error:
         raise WireError(f"map: {error}") from None
+
+
+def _checked_parent(n_bytes: int, padded: bytes) -> bytes:
+    """Return the parent revision of its two fields."""
+    if n_bytes not in (0, REVISION_BYTES) or padded[n_bytes:].strip(b"\0"):
+        raise WireError("map: malformed parent revision")
+    return padded[:n_bytes]
 
 
 def _encode_keyframe(keyframe: Keyframe) -> bytes:

@@ -11,6 +11,7 @@ from vcl_companion.wire.reader import Reader
 
 MAX_AGE_S = 3600.0
 MAX_REASON_BYTES = 90
+MAX_TRACKED = (1 << 16) - 1
 
 # FrameRequest body
 # | 0 | u32 | request id                                            |
@@ -22,7 +23,9 @@ _FRAME_REQUEST = struct.Struct("<Id")
 # | 1 | 8 bytes | revision, zeros when there is none       |
 # | 9 | u32     | landmarks of that map                    |
 # | 13 | u8     | 1: localized in it now, 0: not           |
-_MAP_STATE = struct.Struct("<B8sIB")
+# | 14 | u8     | 1: wants it updated, 0: not              |
+# | 15 | u16    | landmarks that agreed in the last frame  |
+_MAP_STATE = struct.Struct("<B8sIBBH")
 
 # MapRefused body
 # | 0 | u32  | request id                                |
@@ -55,17 +58,23 @@ class MapState:
         revision: 8 bytes (``revision_of``), or empty without a map.
         n_landmarks: of that map.
         localized: whether it localizes in it now.
+        tracked: landmarks that agreed on the pose of its last frame; 0 when there is none.
+        wants_update: its vote: it sees too few of them (IV-G).
     """
 
     revision: bytes
     n_landmarks: int
     localized: bool
+    tracked: int = 0
+    wants_update: bool = False
 
     def __post_init__(self) -> None:
         if len(self.revision) not in (0, REVISION_BYTES):
             raise ValueError(f"a revision has 0 or {REVISION_BYTES} bytes: {self.revision!r}")
         if not 0 <= self.n_landmarks <= MAX_LANDMARKS:
             raise ValueError(f"a map of {self.n_landmarks} landmarks, at most {MAX_LANDMARKS}")
+        if not 0 <= self.tracked <= MAX_TRACKED:
+            raise ValueError(f"tracked landmarks have 16 bits: {self.tracked}")
 
 
 @dataclass(frozen=True)
@@ -109,19 +118,26 @@ def decode_frame_request(body: bytes) -> FrameRequest:
 def encode_map_state(message: MapState) -> bytes:
     """Return the body of a map state."""
     return _MAP_STATE.pack(
-        len(message.revision), message.revision, message.n_landmarks, message.localized
+        len(message.revision),
+        message.revision,
+        message.n_landmarks,
+        message.localized,
+        message.wants_update,
+        message.tracked,
     )
 
 
 def decode_map_state(body: bytes) -> MapState:
     """Return the map state of a body, or raise WireError."""
     reader = Reader(body, "map state")
-    n_revision, revision, n_landmarks, localized = reader.unpack(_MAP_STATE)
+    n_revision, revision, n_landmarks, localized, wants, tracked = reader.unpack(_MAP_STATE)
     reader.finish()
-    if n_revision > REVISION_BYTES or revision[n_revision:].strip(b"\0") or localized > 1:
+    if n_revision > REVISION_BYTES or revision[n_revision:].strip(b"\0"):
         raise WireError("map state: malformed")
+    if localized > 1 or wants > 1:
+        raise WireError("map state: neither yes nor no")
     try:
-        return MapState(revision[:n_revision], n_landmarks, bool(localized))
+        return MapState(revision[:n_revision], n_landmarks, bool(localized), tracked, bool(wants))
     except ValueError as error:
         raise WireError(f"map state: {error}") from None
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from tests.daemon import demo
-from vcl_companion.daemon.first_map import build_map
+from vcl_companion.daemon.map_building import build_map
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.mapping.drone_view import encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap

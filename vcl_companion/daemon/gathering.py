@@ -1,0 +1,152 @@
+"""The frames of one round: asked of every member alive, several of those that are lost."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vcl_companion.clock import Clock
+from vcl_companion.swarm.group import Group
+from vcl_companion.wire.frame_codec import FrameAnswer
+from vcl_companion.wire.messages import MAX_AGE_S, FrameRequest
+
+_ASK_AGAIN_S = 1.0
+# Earlier frames are a help, not a condition: who has none does not answer, and is not waited for.
+_EARLIER_WAIT_S = 2.0
+_IDS_A_ROUND = 16
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which frames a round wants.
+
+    Attributes:
+        at_ns: the instant of every member's first one, our clock.
+        earlier: how many more of some members.
+        spacing_s: time between a member's frames.
+        timeout_s: how long to wait for all of them.
+    """
+
+    at_ns: int
+    earlier: Mapping[int, int] = field(default_factory=dict)
+    spacing_s: float = 1.0
+    timeout_s: float = 20.0
+
+
+@dataclass
+class _FromPeer:
+    """What one member has sent of this round; one request is open at a time."""
+
+    frames: list[FrameAnswer] = field(default_factory=list)
+    since_s: float = float("-inf")  # the open request's first asking
+    asked_at_s: float = float("-inf")
+
+
+class Gathering:
+    """Asks peers for frames and takes in what was asked for; one round after the other.
+
+    Args:
+        group: whom to ask.
+        ask: sends a request to a peer.
+        clock: time base of frames.
+        rng: numbers the requests, so that a restarted coordinator's are not
+            taken for those of its earlier life.
+    """
+
+    def __init__(
+        self,
+        group: Group,
+        ask: Callable[[FrameRequest, int], None],
+        clock: Clock,
+        rng: np.random.Generator,
+    ) -> None:
+        self._group = group
+        self._ask = ask
+        self._clock = clock
+        self._first_id = int(rng.integers(1 << 32))
+        self._peers: dict[int, _FromPeer] | None = None  # None between rounds
+        self._came = asyncio.Event()
+
+    @property
+    def request_id(self) -> int:
+        """Of the round's first frames."""
+        return self._first_id
+
+    def take(self, peer: int, frame: FrameAnswer) -> bool:
+        """Take a peer's frame; False when nobody asked for it."""
+        if self._peers is None or frame.drone_id != peer or peer not in self._peers:
+            return False
+        sent = self._peers[peer]
+        if frame.request_id != self._id_of(len(sent.frames)):
+            return False
+        sent.frames.append(frame)
+        sent.asked_at_s = sent.since_s = float("-inf")
+        self._came.set()
+        return True
+
+    def begin(self) -> int:
+        """Begin a round and return its request id; what is still open of the last one is not."""
+        self._first_id = (self._first_id + _IDS_A_ROUND) % (1 << 32)
+        self._peers = {}
+        return self._first_id
+
+    async def gather(self, wanted: Wanted, is_over: Callable[[], bool]) -> list[FrameAnswer]:
+        """Ask, again and again, until all have answered, time is up, or ``is_over``.
+
+        Returns:
+            What has come, of each member the latest frame first.
+        """
+        assert self._peers is not None, "a round has not begun"
+        with suppress(TimeoutError):
+            async with asyncio.timeout(wanted.timeout_s):
+                while not is_over():
+                    open_ = [peer for peer in self._group.alive if self._is_open(peer, wanted)]
+                    if not open_:
+                        break
+                    for peer in open_:
+                        self._ask_for_next(peer, wanted)
+                    await self._news()
+        came = [frame for sent in self._peers.values() for frame in sent.frames]
+        self._peers = None
+        return came
+
+    def _is_open(self, member: int, wanted: Wanted) -> bool:
+        """Whether something of a member is still to come."""
+        if member == self._group.own_id or self._peers is None:
+            return False
+        sent = self._peers.setdefault(member, _FromPeer())
+        if not sent.frames:
+            return True
+        if len(sent.frames) > wanted.earlier.get(member, 0):
+            return False
+        return sent.since_s == float("-inf") or self._now_s() < sent.since_s + _EARLIER_WAIT_S
+
+    def _ask_for_next(self, peer: int, wanted: Wanted) -> None:
+        assert self._peers is not None
+        sent = self._peers[peer]
+        now_s = self._now_s()
+        if now_s < sent.asked_at_s + _ASK_AGAIN_S:
+            return
+        if sent.since_s == float("-inf"):
+            sent.since_s = now_s
+        sent.asked_at_s = now_s
+        n = len(sent.frames)
+        age_s = (self._clock.now_ns() - wanted.at_ns) * 1e-9 + n * wanted.spacing_s
+        self._ask(FrameRequest(self._id_of(n), min(max(age_s, 0.0), MAX_AGE_S)), peer)
+
+    async def _news(self) -> None:
+        """Wait until something has come, or it is time to look again."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_ASK_AGAIN_S / 4):
+                self._came.clear()
+                await self._came.wait()
+
+    def _id_of(self, n: int) -> int:
+        return (self._first_id + n) % (1 << 32)
+
+    def _now_s(self) -> float:
+        return asyncio.get_running_loop().time()

@@ -1,0 +1,93 @@
+"""What a round builds of its frames: a first map, or the next revision; runs beside the loop."""
+
+from __future__ import annotations
+
+from vcl_companion.daemon.map_store import StoredMap
+from vcl_companion.geometry.rotation import matrix_from_quaternion
+from vcl_companion.mapping.drone_view import DroneView, decode_image
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.options import MapOptions, NoMap
+from vcl_companion.mapping.reconstruction import reconstruct
+from vcl_companion.mapping.update import extend_map
+from vcl_companion.vision.features import FeatureOptions, detect
+from vcl_companion.wire.frame_codec import FrameAnswer
+
+Distances = tuple[tuple[int, int, float], ...]
+
+
+def build_map(
+    frames: list[FrameAnswer],
+    leader: int,
+    known_distances: Distances,
+    map_options: MapOptions,
+    features: FeatureOptions,
+) -> LandmarkMap | NoMap:
+    """Build the first map of a round's frames; takes a second or two.
+
+    Args:
+        frames: one of each drone that answered.
+        leader: system id of the drone whose body is the world's origin.
+        known_distances: (drone, drone, metres).
+        map_options: thresholds.
+        features: how they are found.
+
+    Returns:
+        A map, or why there is none. A frame whose image cannot be used is left
+        out, unless it is the leader's.
+    """
+    views: list[DroneView] = []
+    for frame in sorted(frames, key=lambda f: f.drone_id):
+        view = _view(frame, map_options, features)
+        if isinstance(view, DroneView):
+            views.append(view)
+        elif frame.drone_id == leader:
+            return NoMap(f"the leader's frame: {view.reason}")
+    return reconstruct(views, leader, list(known_distances), map_options)
+
+
+def update_map(
+    stored: StoredMap,
+    frames: list[FrameAnswer],
+    map_options: MapOptions,
+    features: FeatureOptions,
+) -> LandmarkMap | NoMap:
+    """Build the next revision of a map of a round's frames (IV-G); takes some seconds.
+
+    Args:
+        stored: the map in use.
+        frames: of each drone that answered, several of some.
+        map_options: thresholds.
+        features: how they are found.
+
+    Returns:
+        A map whose parent is ``stored``, or why there is none. A frame whose
+        image cannot be used, or that came twice, is left out.
+    """
+    shown = {(f.drone_id, f.captured_at_ns): f for f in frames}
+    made = [_view(shown[key], map_options, features) for key in sorted(shown)]
+    views = [view for view in made if isinstance(view, DroneView)]
+    if not views:
+        return NoMap("no frame has come that can be used")
+    return extend_map(
+        stored.index.landmark_map, stored.revision, views, map_options, features=features
+    )
+
+
+def _view(
+    frame: FrameAnswer, map_options: MapOptions, features: FeatureOptions
+) -> DroneView | NoMap:
+    """Make of a frame what the map builder needs, or say why it cannot be used."""
+    try:
+        image = decode_image(frame.image_bytes, frame.camera)
+    except ValueError as error:
+        return NoMap(str(error))
+    attitude = frame.ned_from_body
+    return DroneView(
+        frame.drone_id,
+        frame.captured_at_ns,
+        frame.camera,
+        frame.body_from_cam,
+        None if attitude is None else matrix_from_quaternion(attitude),
+        frame.image_bytes,
+        tuple(detect(image, detector, features) for detector in map_options.detectors),
+    )

@@ -1,0 +1,239 @@
+"""The coordinator's rounds: gather frames of every drone, build, decide; first map and updates.
+
+A round begins with a frame of its own, asks every member for its frame of the
+same instant, and ends with a map or with the reason why there is none; the
+next one begins with a newer frame. Without a map it makes a first one; with
+one, the next revision as soon as the majority wants it (IV-G).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+
+from vcl_companion.cameras.source import Frame
+from vcl_companion.clock import Clock
+from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.frame_history import FrameHistory
+from vcl_companion.daemon.gathering import Gathering, Wanted
+from vcl_companion.daemon.map_building import Distances, build_map, update_map
+from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.options import MapOptions, NoMap
+from vcl_companion.swarm.group import Group
+from vcl_companion.swarm.updates import UpdateOptions, UpdateTrigger
+from vcl_companion.vision.features import FeatureOptions
+from vcl_companion.wire.frame_codec import FrameAnswer
+from vcl_companion.wire.messages import FrameRequest
+
+_log = logging.getLogger(__name__)
+
+_LOOK_S = 0.1
+# A camera that delivers nothing new has nothing for a map either.
+_STALE_NS = 60 * 1_000_000_000
+
+# Nobody needs longer than so many times the patience to hand over a map, whatever trickles in.
+_MAX_DELIVERIES = 10.0
+
+Decide = Callable[[LandmarkMap | NoMap, StoredMap | None, int], Awaitable[None]]
+"""Takes what became of a round, the map in use when it began (None: a first one), its id."""
+
+
+@dataclass(frozen=True)
+class RoundOptions:
+    """What rounds are tuned by.
+
+    Attributes:
+        known_distances: (drone, drone, metres).
+        map: thresholds of the building.
+        update: when and how maps are updated.
+        features: how they are found.
+    """
+
+    known_distances: Distances
+    map: MapOptions
+    update: UpdateOptions
+    features: FeatureOptions
+
+
+class MapRounds:
+    """Makes rounds while this drone coordinates; see the module.
+
+    Args:
+        group: who is there, and who wants what.
+        frames: our own.
+        maps: where the result goes, by ``decide``.
+        describe: makes the answer that a peer would give of one of our frames.
+        ask: sends a request to a peer.
+        decide: takes what became of a round.
+        is_receiving_map: whether a peer's map has been coming in lately.
+        log: told of every update that is begun.
+        clock: time base of frames.
+        executor: runs the building.
+        options: of the steps.
+        rng: numbers the requests.
+    """
+
+    def __init__(
+        self,
+        group: Group,
+        frames: FrameHistory,
+        maps: MapStore,
+        describe: Callable[[Frame, int], Awaitable[FrameAnswer]],
+        ask: Callable[[FrameRequest, int], None],
+        decide: Decide,
+        is_receiving_map: Callable[[], bool],
+        log: FlightLog,
+        clock: Clock,
+        executor: Executor,
+        options: RoundOptions,
+        rng: np.random.Generator,
+    ) -> None:
+        self._group = group
+        self._frames = frames
+        self._maps = maps
+        self._describe = describe
+        self._decide = decide
+        self._is_receiving_map = is_receiving_map
+        self._log = log
+        self._clock = clock
+        self._executor = executor
+        self._options = options
+        self._gathering = Gathering(group, ask, clock, rng)
+        self._trigger = UpdateTrigger(options.update, group)
+        self._claimed_since_s: float | None = None
+
+    def take(self, peer: int, frame: FrameAnswer) -> bool:
+        """Take a peer's frame; False when nobody asked for it."""
+        return self._gathering.take(peer, frame)
+
+    async def run(self) -> None:
+        """Make rounds until cancelled; each needs a frame that was not tried before."""
+        began_at_s = self._now_s()
+        tried: Frame | None = None
+        while True:
+            self._trigger.poll(self._now_s())
+            stored, frame = self._maps.current, self._frames.newest
+            if frame is None or frame is tried or self._is_stale(frame):
+                await asyncio.sleep(_LOOK_S)
+            elif stored is None and self._is_first_due(began_at_s):
+                tried = frame
+                await self._first_map(frame)
+            elif stored is not None and self._trigger.is_due(self._now_s()):
+                tried = frame
+                await self._next_revision(stored, frame)
+                self._trigger.ended(self._now_s())
+            else:
+                await asyncio.sleep(_LOOK_S)
+
+    def _is_stale(self, frame: Frame) -> bool:
+        return self._clock.now_ns() - frame.captured_at_ns > _STALE_NS
+
+    def _is_first_due(self, began_at_s: float) -> bool:
+        """Whether a first map is ours to make, and everybody is there or was waited for."""
+        if self._has_map() or not self._group.is_coordinator:
+            return False
+        if self._now_s() - began_at_s >= self._options.map.member_wait_s:
+            return True
+        # Who is heard but has not said yet what it flies on may well have a map.
+        told = all(self._group.state_of(peer) is not None for peer in self._group.peers)
+        return self._group.is_complete and told
+
+    def _has_map(self) -> bool:
+        """Whether there is a map: ours, or of a peer, which will send it (we are late, or back).
+
+        Not for ever: a peer that has said so for long and sends none has none to give.
+        """
+        states = map(self._group.state_of, self._group.peers)
+        if not any(state is not None and state.revision for state in states):
+            self._claimed_since_s = None
+        elif self._claimed_since_s is None:
+            self._claimed_since_s = self._now_s()
+        if self._maps.current is not None or self._claimed_since_s is None:
+            return self._maps.current is not None
+        waited = (self._now_s() - self._claimed_since_s) / self._options.update.delivery_wait_s
+        return waited < (_MAX_DELIVERIES if self._is_receiving_map() else 1.0)
+
+    async def _first_map(self, frame: Frame) -> None:
+        options, leader = self._options, self._group.leader
+
+        def build(frames: list[FrameAnswer]) -> LandmarkMap | NoMap:
+            distances = options.known_distances
+            return build_map(frames, leader, distances, options.map, options.features)
+
+        request_id = self._gathering.begin()
+        wanted = Wanted(frame.captured_at_ns, timeout_s=options.map.gather_timeout_s)
+        frames = await self._gathered(frame, wanted, self._has_map)
+        built = await self._built(frames, build)
+        if not self._has_map():
+            await self._decide(built, None, request_id)
+
+    async def _next_revision(self, stored: StoredMap, frame: Frame) -> None:
+        options, update = self._options, self._options.update
+        lost = self._trigger.lost(self._now_s())
+        reason = f"wanted by drones {_listed(self._group.wanting_update)}"
+        reason += f"; {_listed(lost)} lost" if lost else ""
+        self._log.event("update", reason)
+        _log.info("the map is updated, %s", reason)
+
+        def build(frames: list[FrameAnswer]) -> LandmarkMap | NoMap:
+            return update_map(stored, frames, options.map, options.features)
+
+        request_id = self._gathering.begin()
+        wanted = Wanted(
+            frame.captured_at_ns,
+            dict.fromkeys(lost, update.joiner_frames - 1),
+            update.joiner_spacing_s,
+            update.gather_timeout_s,
+        )
+        frames = await self._gathered(frame, wanted, lambda: self._is_past(stored))
+        built = await self._built(frames, build)
+        # Who is no more the coordinator has no say any more, and a map that came is newer.
+        if not self._is_past(stored):
+            await self._decide(built, stored, request_id)
+
+    def _is_past(self, stored: StoredMap) -> bool:
+        """Whether a round that began with a map has come too late."""
+        return self._maps.current is not stored or not self._group.is_coordinator
+
+    async def _gathered(
+        self, newest: Frame, wanted: Wanted, is_over: Callable[[], bool]
+    ) -> list[FrameAnswer] | NoMap:
+        """Return our own frames and those of the others, or why ours cannot be used."""
+        own = [newest]
+        for n in range(1, 1 + wanted.earlier.get(self._group.own_id, 0)):
+            earlier = self._frames.nearest(wanted.at_ns - round(n * wanted.spacing_s * 1e9))
+            if earlier is not None:
+                own.append(earlier)
+        try:
+            described = [await self._describe(f, self._gathering.request_id) for f in own]
+        except ValueError as error:
+            return NoMap(f"our own frame: {error}")
+        return described + await self._gathering.gather(wanted, is_over)
+
+    async def _built(
+        self,
+        frames: list[FrameAnswer] | NoMap,
+        build: Callable[[list[FrameAnswer]], LandmarkMap | NoMap],
+    ) -> LandmarkMap | NoMap:
+        if isinstance(frames, NoMap):
+            return frames
+        loop = asyncio.get_running_loop()
+        try:
+            return await loop.run_in_executor(self._executor, build, frames)
+        except Exception as error:
+            # Peers' images and numbers went in: none of them may end the flight.
+            _log.exception("a map cannot be built")
+            return NoMap(f"building failed: {type(error).__name__}")
+
+    def _now_s(self) -> float:
+        return asyncio.get_running_loop().time()
+
+
+def _listed(drones: tuple[int, ...]) -> str:
+    return ", ".join(map(str, drones))
