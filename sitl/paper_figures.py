@@ -51,12 +51,12 @@ def rotate_svg(flight: PaperFlight) -> str:
             _draw_surest(surest, estimates, flight.result)
         heading.plot(at_s, true_deg, label="truth", **_TRUTH)
         heading.set(ylabel="heading [°]", title=f"Heading of {drone.name}, by source")
-        heading.legend(**above(5))
+        legend_above(heading, 5)
         for limit in (-0.5, 0.5):
             error.axhline(limit, color=REFUSED, lw=0.9, dashes=(2, 3))
         error.set_ylim(*_yaw_limits(drone, estimates))
         error.set(ylabel="heading error [°]", title="Its error; dotted: 0.5°, the most allowed")
-        error.legend(**above(3))
+        legend_above(error, 3)
         surest.set(xlabel="time [s]", title="Surest observer")
         return svg(figure, "Heading of the turning drone by source, its error, surest observer")
 
@@ -90,7 +90,7 @@ def sparse_svg(fused: PaperFlight, unfused: PaperFlight | None) -> str:
             height.set_title(name)
             tracked.set_xlabel("time [s]")
             for axes in (height, error, tracked):
-                axes.legend(**above(5))
+                legend_above(axes, 5)
         grid[0, 0].set_ylabel("height, −z [m]")
         _focus_height(grid[0, 0], [fused.drone(name) for name in names])
         grid[1, 0].set_ylabel("3-D error [cm]")
@@ -127,12 +127,13 @@ def on_frames(drone: DroneResult, values: Array, errors: PoseErrors) -> Array:
     return out
 
 
-def above(columns: int) -> dict[str, Any]:
-    """Return where a legend stands: over the axes at the right, never on data."""
-    return {
-        "loc": "lower right", "bbox_to_anchor": (1.0, 0.98), "ncols": columns, "fontsize": 8.0,
-        "borderpad": 0.0, "columnspacing": 1.0, "handlelength": 1.6, "handletextpad": 0.5,
-    }  # fmt: skip
+def legend_above(axes: Axes, columns: int) -> None:
+    """Put a legend over the axes at the right, never on data; none where nothing is labelled."""
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(
+            loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=columns, fontsize=8.0,
+            borderpad=0.0, columnspacing=1.0, handlelength=1.6, handletextpad=0.5,
+        )  # fmt: skip
 
 
 def log_of_cm(axes: Axes) -> None:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.ticker import MaxNLocator
 
-from sitl.paper_figures import WITHOUT, above, log_of_cm, norm_cm, on_frames
+from sitl.paper_figures import WITHOUT, legend_above, log_of_cm, norm_cm, on_frames
 from sitl.paper_flights import PaperFlight
 from sitl.paper_measures import path_length_m
 from sitl.plotting import (
@@ -56,7 +56,7 @@ def trajectories_svg(fused: PaperFlight, unfused: PaperFlight | None) -> str:
                 )  # fmt: skip
                 _focus_path(axes, fused.drone(name), axis, sign)
                 axes.set_ylabel(label)
-                axes.legend(**above(3))
+                legend_above(axes, 3)
             grid[0, column].set_title(name)
             grid[1, column].set_xlabel("X, depth: towards the façade [m]")
         return svg(figure, "Trajectories of the forward and backward flight")
@@ -78,7 +78,7 @@ def axis_errors_svg(fused: PaperFlight, unfused: PaperFlight | None, name: str) 
             grid[row, 0].yaxis.set_major_locator(MaxNLocator(5, symmetric=True))
         for column, flight in enumerate(flights):
             grid[0, column].set_title(f"{name}, {flight.variant}")
-            grid[0, column].legend(**above(4))
+            legend_above(grid[0, column], 4)
             grid[2, column].set_xlabel("time [s]")
         return svg(figure, f"Error of {name} along each axis, fused and unfused")
 
@@ -117,7 +117,7 @@ def urban_svg(flight: PaperFlight, scenario: Scenario | None) -> str:
         tracked.set(ylabel="landmarks kept in the pose", xlim=(0.0, 1.03 * float(way_m[-1])))
         tracked.set_title("Tracked landmarks")
         tracked.set_ylim(bottom=0.0)
-        tracked.legend(**above(4))
+        legend_above(tracked, 4)
         drift.set(ylabel="3-D error [cm]", xlabel="way flown [m]")
         log_of_cm(drift)
         drift.set_xlim(0.0, 1.03 * float(way_m[-1]))

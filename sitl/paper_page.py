@@ -57,7 +57,7 @@ def page(result: PaperResult, pipelines: Sequence[Pipeline], paper: Mapping[str,
     parts += [_overview(pipelines, paper), _nees(pipelines, paper)]
     for pipeline in pipelines:
         flights = result.flights.get(pipeline.name, {})
-        of = f", {pipeline.title}" if len(pipelines) > 1 else ""
+        of = f", {escape(pipeline.title)}" if len(pipelines) > 1 else ""
         parts += _figures(result, flights, of)
     parts.append(section("How it was flown", _HOW, _how(result, paper)))
     lead = f"{sum(map(len, result.flights.values()))} flights"
