@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ from sitl.plan import FlightPlan, PlannedDrone, Setting
 from vcl_companion.errors import ConfigError
 from vcl_companion.recording.recording import CAMERA_FOLDER
 
+_FLAT_OUT_WAIT_S = 30.0
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -47,6 +49,9 @@ def daemon_config(
         "log": {"flight_log": str(run / "flight.jsonl")},
         "map": {"directory": str(run / "maps")},
     }
+    if math.isinf(plan.options.speed):
+        # The recording's time stands still meanwhile; the outcome must not hang on the machine.
+        wiring["inter"] = {"wait_s": _FLAT_OUT_WAIT_S}
     return with_settings(wiring, plan.options.settings)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -34,6 +34,23 @@ class FrameRow(msgspec.Struct, frozen=True):
     latency_ms: float | None = None
     matched: int = 0
     inliers: int = 0
+    source: Literal["intra", "inter", "fused"] | None = None
+
+
+class EstimateRow(msgspec.Struct, frozen=True):
+    """What one frame alone, or one peer alone (``host``), said of the pose at a frame.
+
+    ``covariance`` is the upper triangle of (6, 6) as in VISION_POSITION_ESTIMATE.
+    """
+
+    captured_at_ns: int
+    source: Literal["intra", "inter"]
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+    covariance: list[float]
+    fused: bool
+    host: int | None = None
+    reason: str | None = None
 
 
 class EventRow(msgspec.Struct, frozen=True):
@@ -71,6 +88,7 @@ class FlightLog:
     """One daemon's ``flight.jsonl``; ``summary`` is None when it did not end cleanly."""
 
     frames: tuple[FrameRow, ...]
+    estimates: tuple[EstimateRow, ...]
     events: tuple[EventRow, ...]
     maps: tuple[MapRow, ...]
     summary: SummaryRow | None
@@ -92,6 +110,7 @@ def read_flight_log(path: Path) -> FlightLog:
         FlightError: a line is not what it should be; names file and row.
     """
     frames: list[FrameRow] = []
+    estimates: list[EstimateRow] = []
     events: list[EventRow] = []
     maps: list[MapRow] = []
     summary: SummaryRow | None = None
@@ -99,13 +118,32 @@ def read_flight_log(path: Path) -> FlightLog:
         match line.get("kind"):
             case "frame":
                 frames.append(_converted(line, FrameRow, path, row))
+            case "estimate":
+                estimates.append(_converted(line, EstimateRow, path, row))
             case "event":
                 events.append(_converted(line, EventRow, path, row))
             case "map":
                 maps.append(_converted(line, MapRow, path, row))
             case "summary":
                 summary = _converted(line, SummaryRow, path, row)
-    return FlightLog(tuple(frames), tuple(events), tuple(maps), summary)
+    # A frame that asks peers about itself is answered after younger ones.
+    frames.sort(key=lambda frame: frame.sequence)
+    return FlightLog(tuple(frames), tuple(estimates), tuple(events), tuple(maps), summary)
+
+
+def estimates_of(rows: Iterable[EstimateRow]) -> Estimates:
+    """Return rows as estimates, their order kept.
+
+    Raises:
+        ValueError: a row holds no rotation, or not 21 covariances.
+    """
+    kept = list(rows)
+    covariances = [covariance_from_upper(np.array(row.covariance, dtype=float)) for row in kept]
+    return Estimates(
+        np.array([row.captured_at_ns for row in kept], dtype=np.int64),
+        tuple(Pose.from_quaternion(np.array(r.quaternion), np.array(r.position)) for r in kept),
+        np.array(covariances).reshape(-1, 6, 6),
+    )
 
 
 class _VisionPosition(msgspec.Struct, frozen=True):

@@ -26,6 +26,7 @@ from vcl_companion.localization.intra import LocalizationOptions
 from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.mapping.reconstruction import MapOptions
 from vcl_companion.swarm.group import SwarmOptions
+from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.swarm.transfer_options import TransferOptions
 from vcl_companion.vision.features import FeatureOptions
 
@@ -69,12 +70,18 @@ class Config:
     features: FeatureOptions = field(default_factory=FeatureOptions)
     localization: LocalizationOptions = field(default_factory=LocalizationOptions)
     filter: FilterOptions = field(default_factory=FilterOptions)
+    inter: InterMavOptions = field(default_factory=InterMavOptions)
     log: LogOptions = field(default_factory=LogOptions)
 
     def __post_init__(self) -> None:
         if self.localization.detector not in self.map.detectors:
             raise ConfigError(
                 f"localization.detector: {self.localization.detector} is not in map.detectors "
+                f"{list(self.map.detectors)}"
+            )
+        if self.inter.detector not in self.map.detectors:
+            raise ConfigError(
+                f"inter.detector: {self.inter.detector} is not in map.detectors "
                 f"{list(self.map.detectors)}"
             )
         if not 1 <= self.system_id <= 255:

@@ -18,13 +18,17 @@ from tests.daemon.autopilot import Autopilot, autopilot_and_link
 from tests.daemon.waiting import beside, until
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import ManualClock
+from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.exchange import Exchange, ExchangeOptions
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.mavlink import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions
+from vcl_companion.localization.intra import LocalizationOptions
+from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.swarm.group import Group, SwarmOptions
+from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.swarm.transfer import (
     BlobKind,
     BlobReceived,
@@ -35,10 +39,13 @@ from vcl_companion.swarm.transfer import (
 from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame
 from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
+from vcl_companion.wire.pose_messages import PoseProposal, PoseRefused
 from vcl_companion.wire.tunnel import PayloadType, decode_payload, encode_payload
 
+Message = FrameRequest | MapState | MapRefused | PoseProposal | PoseRefused
 MESSAGE, DATA = PayloadType.MESSAGE, PayloadType.TRANSFER_DATA
 COMPANION = 197
+INTER = InterMavOptions(detector="akaze")
 FAST = TransferOptions(rate_bytes_per_s=5e6, status_interval_s=0.05)
 
 
@@ -66,6 +73,7 @@ class Drone:
         executor: ThreadPoolExecutor,
         log_path: Path,
         transfer: TransferOptions,
+        inter: InterMavOptions,
         seed: int,
     ) -> None:
         self.system_id = system_id
@@ -75,12 +83,16 @@ class Drone:
         self._log = FlightLog(str(log_path), clock)
         self.maps = MapStore("")
         self.requests: list[FrameRequest] = []
+        self.estimator = Estimator(
+            FilterOptions(), LocalizationOptions(), lambda why: self._log.event("jump", why)
+        )
         swarm = SwarmOptions(members, demo.LEADER, demo.known_distances(1, 2))
         rng = np.random.default_rng(seed)
         self.exchange = Exchange(
             system_id, Group(swarm, system_id), Transfers(transfer, rng), self.maps,
             self._autopilot_link, demo.sensor(system_id), clock, self._log, executor,
-            lambda: False, ExchangeOptions(swarm, demo.MAP_OPTIONS, demo.FEATURES, "akaze"), rng,
+            self.estimator,
+            ExchangeOptions(swarm, demo.MAP_OPTIONS, demo.FEATURES, "akaze", inter), rng,
         )  # fmt: skip
         self._link = PeerLink(
             peers, system_id, frozenset(members), self._hear, self.exchange.on_heartbeat
@@ -132,7 +144,7 @@ class Stranger:
     def __init__(self, system_id: int, members: tuple[int, ...], peers: PeerOptions) -> None:
         self._link = PeerLink(peers, system_id, frozenset(members), self._hear, lambda _: None)
         self.forget()
-        self.messages: asyncio.Queue[FrameRequest | MapState | MapRefused] = asyncio.Queue()
+        self.messages: asyncio.Queue[Message] = asyncio.Queue()
         self.blobs: asyncio.Queue[BlobReceived] = asyncio.Queue()
         self._heard: set[int] = set()
 
@@ -149,7 +161,7 @@ class Stranger:
         """Wait until these have been heard, so that what is said to them arrives."""
         await until(lambda: self._heard.issuperset(system_ids))
 
-    def say(self, message: FrameRequest | MapState | MapRefused, to: int) -> None:
+    def say(self, message: Message, to: int) -> None:
         self._link.send(*encode_payload(message), to)
 
     def say_bytes(self, payload_type: int, payload: bytes, to: int) -> None:
@@ -159,7 +171,7 @@ class Stranger:
         """Send a blob."""
         self._transfers.submit(to, kind, blob, asyncio.get_running_loop().time())
 
-    def heard(self) -> list[FrameRequest | MapState | MapRefused]:
+    def heard(self) -> list[Message]:
         """Take the messages that have come so far."""
         return [self.messages.get_nowait() for _ in range(self.messages.qsize())]
 
@@ -216,6 +228,7 @@ class Swarm:
         system_id: int,
         flies_on: tuple[int, ...] = (),
         transfer: TransferOptions = FAST,
+        inter: InterMavOptions = INTER,
         runs: bool = True,
     ) -> Drone:
         """Start a drone at the instant of its first frame, flying on the map of some if given."""
@@ -232,7 +245,7 @@ class Swarm:
         log_path = self._path / f"{system_id}-{self._n_started}.jsonl"
         drone = Drone(
             system_id, self._members, self._peers(system_id), autopilot, clock, executor,
-            log_path, transfer, self._n_started,
+            log_path, transfer, inter, self._n_started,
         )  # fmt: skip
         life.callback(drone.close)
         if flies_on:
@@ -269,7 +282,7 @@ def tunnel(sender: int, payload_type: int, payload: bytes) -> Tunnel:
     return Tunnel(sender, COMPANION, 0, payload_type, payload)
 
 
-def said(sender: int, message: FrameRequest | MapState | MapRefused) -> Tunnel:
+def said(sender: int, message: Message) -> Tunnel:
     """What a link hands over of a message to everybody."""
     payload_type, payload = encode_payload(message)
     return tunnel(sender, payload_type, payload)

@@ -21,17 +21,22 @@ from tests.daemon.waiting import beside, run, until
 from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import ManualClock
 from vcl_companion.daemon.companion import Companion, CompanionOptions
+from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_history import FrameHistory
+from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
+from vcl_companion.daemon.inter_target import InterTarget
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.geometry.rotation import matrix_from_euler, quaternion_from_matrix
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.localization.intra import LocalizationOptions
 from vcl_companion.localization.pose_filter import FilterOptions
+from vcl_companion.swarm.group import Group, SwarmOptions
+from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
 
 DRONE = 2
-OPTIONS = CompanionOptions(demo.FEATURES, LocalizationOptions(), FilterOptions())
+OPTIONS = CompanionOptions(demo.FEATURES, LocalizationOptions())
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +44,9 @@ class Flight:
     """One drone's line from camera to autopilot, its camera and its autopilot."""
 
     companion: Companion
+    estimator: Estimator
+    outcomes: FrameOutcomes
+    clock: ManualClock
     server: FrameServer
     autopilot: Autopilot
     link: AutopilotLink
@@ -54,6 +62,10 @@ class Flight:
         self.autopilot.measure(shot.at_ns, quaternion_from_matrix(turned))
         self.server.give(k if sequence is None else sequence, shot.at_ns, demo.png(shot.image))
 
+    @property
+    def is_localized(self) -> bool:
+        return self.estimator.is_localized(self.clock.now_ns())
+
     def fly_on_a_map(self) -> None:
         self.maps.replace(demo.encoded_map(1, 2, 3), demo.map_index(1, 2, 3))
 
@@ -68,6 +80,15 @@ class Flight:
             for line in lines
             if line["kind"] == "frame"
         ]
+
+
+def nobody_to_ask(executor: ThreadPoolExecutor, clock: ManualClock) -> InterTarget:
+    """The target's side of inter-MAV localization of a drone alone."""
+    alone = HostChoice(Group(SwarmOptions(), DRONE))
+    return InterTarget(
+        DRONE, alone, demo.sensor(DRONE), clock, executor, lambda _, __: 0, lambda _: None,
+        InterMavOptions(), np.random.default_rng(0),
+    )  # fmt: skip
 
 
 @contextlib.asynccontextmanager
@@ -89,13 +110,28 @@ async def flight(path: Path) -> AsyncIterator[Flight]:
         log = stack.enter_context(contextlib.closing(FlightLog(str(path / "log"), clock)))
         executor = stack.enter_context(ThreadPoolExecutor(1))
         maps, history = MapStore(""), FrameHistory()
+        health = Health(link, log)
+        outcomes = FrameOutcomes(camera, clock, health, log)
+        estimator = Estimator(FilterOptions(), OPTIONS.localization, lambda _: None)
         companion = Companion(
-            camera, sensor, clock, link, maps, history.add, Health(link, log), log, executor,
-            OPTIONS,
+            camera, outcomes, sensor, link, maps, estimator, nobody_to_ask(executor, clock),
+            history.add, health, log, executor, OPTIONS,
         )  # fmt: skip
         await stack.enter_async_context(beside(link.run()))
         assert await link.attitude_at(first.at_ns, 5.0) is not None
-        yield Flight(companion, server, autopilot, link, maps, history, log, path / "log")
+        yield Flight(
+            companion,
+            estimator,
+            outcomes,
+            clock,
+            server,
+            autopilot,
+            link,
+            maps,
+            history,
+            log,
+            path / "log",
+        )
 
 
 @contextlib.asynccontextmanager
@@ -110,7 +146,7 @@ def test_frames_become_poses_near_the_truth(tmp_path: Path) -> None:
     async def scenario() -> None:
         async with flying(tmp_path) as up:
             up.fly_on_a_map()
-            assert not up.companion.is_localized
+            assert not up.is_localized
             for k in range(3):
                 up.give(k)
                 await up.server.answered()
@@ -120,7 +156,7 @@ def test_frames_become_poses_near_the_truth(tmp_path: Path) -> None:
                 error_m = np.linalg.norm(sent - demo.world_from_body(DRONE, k).translation)
                 assert 1e-5 < error_m < 0.15
                 assert pose[-1] == 0  # reset_counter
-            assert up.companion.is_localized
+            assert up.is_localized
             assert set(up.server.outcomes.values()) == {"localized"}
             assert up.frames() == [(k, "localized", None) for k in range(3)]
             newest = up.history.newest
@@ -255,7 +291,7 @@ def test_a_picture_without_anything_in_it_is_refused_with_a_reason(tmp_path: Pat
             assert (sequence, outcome) == (0, "refused")
             assert reason
             assert up.autopilot.poses.empty()
-            assert not up.companion.is_localized
+            assert not up.is_localized
             assert (await up.autopilot.texts.get()) == f"VCL waiting: {reason}"
 
     run(scenario())
@@ -283,9 +319,9 @@ def test_a_fix_of_long_ago_is_no_place_any_more(tmp_path: Path) -> None:
             up.fly_on_a_map()
             up.give(0)
             await up.server.answered()
-            assert up.companion.is_localized
+            assert up.is_localized
             up.server.tell_time(demo.shot(DRONE).at_ns + 2_100_000_000)
-            await until(lambda: not up.companion.is_localized)
+            await until(lambda: not up.is_localized)
 
     run(scenario())
 
@@ -298,10 +334,10 @@ def test_what_is_open_when_the_service_ends_is_answered_then(tmp_path: Path) -> 
                 up.give(0)
                 assert await up.autopilot.texts.get() == "VCL waiting for a map"
             assert up.frames() == []
-            up.companion.end()
+            up.outcomes.end()
             await up.server.answered()
             assert up.frames() == [(0, "refused", "the service has ended")]
-            up.companion.end()
+            up.outcomes.end()
             assert len(up.frames()) == 1
 
     run(scenario())

@@ -9,6 +9,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import exp_so3
 from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
 from vcl_companion.wire.frame_codec import FrameAnswer
+from vcl_companion.wire.pose_messages import PoseProposal
 
 CAMERAS = (
     Camera(640, 480, 400.5, 401.25, 319.5, 239.5),
@@ -101,3 +102,9 @@ def small_frame() -> FrameAnswer:
         camera=CAMERAS[3],
         image_bytes=b"an image",
     )
+
+
+def small_proposal() -> PoseProposal:
+    root = np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) + 0.005 * np.tri(6)
+    pose = Pose.from_quaternion(np.array([0.8, 0.0, 0.6, 0.0]), np.array([12.5, -3.25, -40.0]))
+    return PoseProposal.of(77, bytes(range(8)), pose, root @ root.T)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 from hypothesis import strategies as st
 
+from tests.wire.samples import random_pose
 from vcl_companion.wire.chunks import CHUNK_DATA_BYTES, MAX_CHUNKS, Chunk, Reply, TransferStatus
 from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
+from vcl_companion.wire.pose_messages import PoseProposal, PoseRefused
 
 _tags = st.integers(0, (1 << 32) - 1)
 _asks = st.integers(1, 127)
@@ -48,10 +51,25 @@ statuses = st.one_of(
 _request_ids = st.integers(0, (1 << 32) - 1)
 _revisions = st.one_of(st.just(b""), st.binary(min_size=8, max_size=8))
 
+
+@st.composite
+def proposals(draw: st.DrawFn) -> PoseProposal:
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    root = rng.normal(0.0, 1.0, (6, 6)) * (10.0 ** rng.uniform(-4, 0, 6))[:, None]
+    return PoseProposal.of(
+        draw(_request_ids),
+        draw(st.binary(min_size=8, max_size=8)),
+        random_pose(rng, draw(st.sampled_from([0.0, 50.0, 20_000.0]))),
+        root @ root.T,
+    )
+
+
 messages = st.one_of(
     st.builds(FrameRequest, _request_ids, st.floats(0.0, 3600.0)),
     st.builds(MapState, _revisions, st.integers(0, 32_768), st.booleans()),
     st.builds(MapRefused.because, _request_ids, st.text()),
+    proposals(),
+    st.builds(PoseRefused.because, _request_ids, st.text()),
 )
 
 payload_values = st.one_of(chunks, statuses, messages)

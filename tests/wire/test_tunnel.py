@@ -7,11 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.wire.golden import assert_golden
+from tests.wire.samples import small_proposal
 from tests.wire.strategies import payload_values
 from vcl_companion.errors import WireError
 from vcl_companion.wire.chunks import CHUNK_DATA_BYTES, Chunk, Reply, TransferStatus
 from vcl_companion.wire.header import PROTOCOL_VERSION, PayloadKind, VersionMismatchError
 from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
+from vcl_companion.wire.pose_messages import PoseRefused
 from vcl_companion.wire.tunnel import (
     PayloadType,
     TunnelPayload,
@@ -31,6 +33,8 @@ _GOLDEN: dict[str, TunnelPayload] = {
     "map_state": MapState(bytes(range(8)), 1000, True),
     "map_state_none": MapState(b"", 0, False),
     "map_refused": MapRefused(78, "zu wenig Überlappung"),
+    "pose_proposal": small_proposal(),
+    "pose_refused": PoseRefused(79, "3 landmarks in common"),
 }
 
 
@@ -126,6 +130,8 @@ def test_any_text_makes_a_reason(text: str, request_id: int) -> None:
         lambda: MapState(b"", 1 << 20, True),
         lambda: MapRefused(1, "two\nlines"),
         lambda: MapRefused(1, ""),
+        lambda: PoseRefused(1, "two\nlines"),
+        lambda: PoseRefused(-1, "why"),
         lambda: TransferStatus(1, Reply.RECEIVING, 1, 0, 10, ((5, 5),)),
         lambda: TransferStatus(1, Reply.RECEIVING, 1, 0, 10, ((5, 6), (6, 7))),
         lambda: TransferStatus(1, Reply.RECEIVING, 1, 0, 10, ((5, 11),)),

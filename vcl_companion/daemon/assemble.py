@@ -20,8 +20,10 @@ from vcl_companion.clock import Clock, ManualClock, SystemClock
 from vcl_companion.config import Config
 from vcl_companion.daemon import notify
 from vcl_companion.daemon.companion import Companion, CompanionOptions
+from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.exchange import Exchange, ExchangeOptions
 from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.errors import VclError
@@ -82,6 +84,8 @@ async def _run(config: Config) -> int:
     camera = open_camera(config.camera, sensor, clock)
     autopilot = AutopilotLink(config.autopilot, config.system_id, clock)
     health = Health(autopilot, log)
+    outcomes = FrameOutcomes(camera, clock, health, log)
+    estimator = Estimator(config.filter, config.localization, lambda why: log.event("jump", why))
     # Frames never wait for a map that is being built: one thread for each.
     vision = ThreadPoolExecutor(1, "vision")
     mapping = ThreadPoolExecutor(1, "mapping")
@@ -96,21 +100,29 @@ async def _run(config: Config) -> int:
         clock,
         log,
         mapping,
-        lambda: companion.is_localized,
-        ExchangeOptions(config.swarm, config.map, config.features, config.localization.detector),
+        estimator,
+        ExchangeOptions(
+            config.swarm,
+            config.map,
+            config.features,
+            config.localization.detector,
+            config.inter,
+        ),
         rng,
     )
     companion = Companion(
         camera,
+        outcomes,
         sensor,
-        clock,
         autopilot,
         maps,
+        estimator,
+        exchange.inter,
         exchange.on_frame,
         health,
         log,
         vision,
-        CompanionOptions(config.features, config.localization, config.filter),
+        CompanionOptions(config.features, config.localization),
     )
     peers = PeerLink(
         config.peers,
@@ -133,7 +145,7 @@ async def _run(config: Config) -> int:
         )
     finally:
         try:
-            companion.end()
+            outcomes.end()
             with suppress(TimeoutError):
                 async with asyncio.timeout(_CLOSE_S):
                     await camera.close()

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from collections.abc import Callable
 from concurrent.futures import Executor
-from contextlib import suppress
 from dataclasses import dataclass
 
-from vcl_companion.cameras.source import CameraSource, Frame, Outcome
-from vcl_companion.clock import Clock, ManualClock
-from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.cameras.source import CameraSource, Frame
+from vcl_companion.daemon.estimator import Estimator
+from vcl_companion.daemon.flight_log import FlightLog, PoseSource
+from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
+from vcl_companion.daemon.inter_target import Asked, InterTarget
 from vcl_companion.daemon.mailbox import Mailbox
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.geometry.rotation import Array
@@ -24,26 +24,17 @@ from vcl_companion.localization.intra import (
     NotLocalized,
     localize_intra,
 )
-from vcl_companion.localization.pose_filter import (
-    FilterOptions,
-    FilterState,
-    predict,
-    started,
-    update,
-)
+from vcl_companion.localization.pose_filter import FilterState, NotFused
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.vision.features import FeatureOptions, detect
+from vcl_companion.wire.pose_messages import PoseProposal
 
 _log = logging.getLogger(__name__)
 
 # How long an attitude sample may still be on its way when its frame is here.
 ATTITUDE_WAIT_S = 0.1
-# So many fixes in a row that contradict the state are right, and the state is wrong.
-_MAX_CONTRADICTED = 5
 # How long the last frames of a stream may take.
 _LAST_FRAMES_S = 5.0
-# A fix this old is no more where we are.
-_FRESH_NS = 2_000_000_000
 
 
 @dataclass(frozen=True)
@@ -52,21 +43,22 @@ class CompanionOptions:
 
     features: FeatureOptions
     localization: LocalizationOptions
-    filter: FilterOptions
 
 
 class Companion:
     """Takes the newest frame, localizes it, sends the pose; one frame at a time.
 
     Args:
-        camera: where frames come from, and where each is answered.
+        camera: where frames come from.
+        outcomes: where each is answered.
         sensor: the camera's calibration and mounting.
-        clock: time base of the frames.
         autopilot: gives attitude, takes poses.
         maps: the current map.
+        estimator: the pose filter.
+        inter: asks peers where we are.
         on_frame: shown every frame as it arrives (the exchange keeps some for peers).
-        health: told of every outcome.
-        log: told of every frame.
+        health: told while a frame waits for a map.
+        log: told of every estimate.
         executor: runs the vision, beside the event loop.
         options: of the steps.
     """
@@ -74,10 +66,12 @@ class Companion:
     def __init__(
         self,
         camera: CameraSource,
+        outcomes: FrameOutcomes,
         sensor: Sensor,
-        clock: Clock,
         autopilot: AutopilotLink,
         maps: MapStore,
+        estimator: Estimator,
+        inter: InterTarget,
         on_frame: Callable[[Frame], None],
         health: Health,
         log: FlightLog,
@@ -85,29 +79,19 @@ class Companion:
         options: CompanionOptions,
     ) -> None:
         self._camera = camera
+        self._outcomes = outcomes
         self._sensor = sensor
-        self._clock = clock
         self._autopilot = autopilot
         self._maps = maps
+        self._estimator = estimator
+        self._inter = inter
         self._on_frame = on_frame
         self._health = health
         self._log = log
         self._executor = executor
         self._options = options
         self._mailbox = Mailbox()
-        self._state: FilterState | None = None
-        self._n_resets = 0
-        self._n_contradicted = 0
-        self._last_sequence: int | None = None
-        self._open: list[Frame] = []
         self._over = asyncio.Event()
-        self._answered = asyncio.Event()
-
-    @property
-    def is_localized(self) -> bool:
-        """Whether a frame of the last two seconds gave a pose."""
-        state = self._state
-        return state is not None and self._clock.now_ns() - state.fixed_at_ns <= _FRESH_NS
 
     async def read_camera(self) -> None:
         """Move frames from the camera to the mailbox until the stream ends and all are answered.
@@ -116,32 +100,26 @@ class Companion:
         that is being localized when that is done.
         """
         async for frame in self._camera.frames():
-            self._note_gap(frame)
-            self._open.append(frame)
+            self._outcomes.opened(frame)
             replaced = self._mailbox.put(frame)
             if replaced is not None:
                 self._drop(replaced)
             self._on_frame(frame)
         _log.info("the camera's stream is over")
         self._over.set()
-        with suppress(TimeoutError):
-            async with asyncio.timeout(_LAST_FRAMES_S):
-                while self._open:
-                    self._answered.clear()
-                    await self._answered.wait()
-
-    def end(self) -> None:
-        """Answer what is still open as the service ends; nothing else may run any more."""
-        for frame in list(self._open):
-            self._log_refused(frame, NotLocalized("the service has ended"))
+        await self._outcomes.all_answered(_LAST_FRAMES_S)
 
     async def run(self) -> None:
         """Localize frames until cancelled."""
-        while True:
-            frame = await self._mailbox.take()
-            stored = self._maps.current or await self._first_map(frame)
-            if stored is not None:
-                await self._localize(frame, stored)
+        async with asyncio.TaskGroup() as asking:
+            while True:
+                frame = await self._mailbox.take()
+                stored = self._maps.current or await self._first_map(frame)
+                if stored is None:
+                    continue
+                asked = await self._localize(frame, stored)
+                if asked is not None:
+                    asking.create_task(self._hear_peers(asked[0], stored, asked[1]))
 
     async def _first_map(self, frame: Frame) -> StoredMap | None:
         """Wait for a first map as long as no newer frame comes; answer the frame if none does."""
@@ -155,24 +133,31 @@ class Companion:
             for waiting in (decided, newer, over):
                 waiting.cancel()
         if self._maps.current is None:
-            self._refuse(frame, self._no_map())
+            self._outcomes.refuse(frame, self._no_map())
         return self._maps.current
 
     def _no_map(self) -> NotLocalized:
         ended = "the camera's stream is over" if self._over.is_set() else "none yet"
         return NotLocalized(f"no map: {self._maps.refusal or ended}")
 
-    async def _localize(self, frame: Frame, stored: StoredMap) -> None:
+    async def _localize(
+        self, frame: Frame, stored: StoredMap
+    ) -> tuple[Asked, NotLocalized | None] | None:
+        """Localize a frame by the map, and answer it unless peers are asked about it as well.
+
+        Returns:
+            The request to peers, and why the frame itself gave no pose; None
+            when nobody is asked and the frame is answered.
+        """
         loop = asyncio.get_running_loop()
-        attitude_soon = asyncio.ensure_future(
-            self._autopilot.attitude_at(frame.captured_at_ns, ATTITUDE_WAIT_S)
-        )
+        at_ns = frame.captured_at_ns
+        attitude_soon = asyncio.ensure_future(self._autopilot.attitude_at(at_ns, ATTITUDE_WAIT_S))
         features = await loop.run_in_executor(
             self._executor, detect, frame.image, stored.index.detector, self._options.features
         )
         attitude = await attitude_soon
         ned_from_body = None if attitude is None else attitude.ned_from_body
-        predicted = self._predicted(frame, ned_from_body)
+        predicted = self._estimator.predicted(at_ns, ned_from_body)
         fix = await loop.run_in_executor(
             self._executor,
             localize_intra,
@@ -184,106 +169,95 @@ class Companion:
             ned_from_body,
             self._options.localization,
         )
+        refused = self._take(frame, fix, ned_from_body)
+        asked = self._inter.begin(frame, ned_from_body, stored.revision, refused is not None)
+        if asked is not None:
+            return asked, refused
+        if refused is None:
+            self._outcomes.close(frame)
+        else:
+            self._outcomes.refuse(frame, refused)
+        return None
+
+    def _take(
+        self, frame: Frame, fix: Localized | NotLocalized, ned_from_body: Array | None
+    ) -> NotLocalized | None:
+        """Bring the state up to what the frame gave and send it; or say why there is nothing."""
+        at_ns = frame.captured_at_ns
+        # Again, not as it was before the vision: a proposal may have come meanwhile.
+        predicted = self._estimator.predicted(at_ns, ned_from_body)
         if isinstance(fix, NotLocalized):
-            self._refuse(frame, fix)
-            return
-        state = self._updated(predicted, fix, frame, ned_from_body)
+            self._estimator.take_nothing(predicted, at_ns, ned_from_body)
+            return fix
+        state = self._estimator.take_fix(predicted, fix, at_ns, ned_from_body)
+        refused = state if isinstance(state, NotLocalized) else None
+        self._log.estimate(
+            at_ns,
+            fix.world_from_body,
+            fix.covariance(),
+            fused=refused is None,
+            reason=refused.reason if refused else "",
+        )
         if isinstance(state, NotLocalized):
-            self._refuse(frame, state)
-            return
-        self._state = state
-        self._send(frame, fix, state)
+            return state
+        return self._send(frame, state, "intra", fix.n_matched, fix.n_inliers)
 
-    def _predicted(self, frame: Frame, ned_from_body: Array | None) -> FilterState | None:
-        if self._state is None:
-            return None
-        return predict(self._state, frame.captured_at_ns, ned_from_body, self._options.filter)
+    async def _hear_peers(
+        self, asked: Asked, stored: StoredMap, refused: NotLocalized | None
+    ) -> None:
+        """Fuse what peers say of a frame, answer it, and fuse what comes too late for that."""
+        state = None
+        for host, proposal in await self._inter.ask(asked):
+            state = self._fuse(host, proposal, asked, stored) or state
+        if refused is None:
+            self._outcomes.close(asked.frame, None if state is None else "fused")
+        elif state is None:
+            self._outcomes.refuse(asked.frame, refused)
+        else:
+            unsent = self._send(asked.frame, state, "inter")
+            if unsent is None:
+                self._outcomes.close(asked.frame)
+            else:
+                self._outcomes.refuse(asked.frame, unsent)
+        for host, proposal in await self._inter.stragglers(asked):
+            self._fuse(host, proposal, asked, stored)
 
-    def _updated(
+    def _fuse(
+        self, host: int, proposal: PoseProposal, asked: Asked, stored: StoredMap
+    ) -> FilterState | None:
+        """Fuse a proposal at its frame's own time; return the state of that instant if taken."""
+        at_ns = asked.frame.captured_at_ns
+        pose, covariance = proposal.world_from_body, proposal.covariance
+        state = self._estimator.take_proposal(
+            at_ns, asked.ned_from_body, pose, covariance, stored.index
+        )
+        why = state.reason if isinstance(state, NotFused) else ""
+        self._log.estimate(at_ns, pose, covariance, fused=not why, host=host, reason=why)
+        return None if isinstance(state, NotFused) else state
+
+    def _send(
         self,
-        predicted: FilterState | None,
-        fix: Localized,
         frame: Frame,
-        ned_from_body: Array | None,
-    ) -> FilterState | NotLocalized:
-        if predicted is not None:
-            state = update(predicted, fix)
-            if isinstance(state, FilterState):
-                self._n_contradicted = 0
-                if state.n_jumps > predicted.n_jumps:
-                    self._jumped(fix)
-                return state
-            # One fix against the state is wrong; several in a row say that the state
-            # is, or that the autopilot has turned its north.
-            self._n_contradicted += 1
-            if self._n_contradicted < _MAX_CONTRADICTED:
-                return state
-            self._n_contradicted = 0
-        if self._state is not None:
-            self._jumped(fix)
-        return started(fix, frame.captured_at_ns, ned_from_body, self._options.filter)
-
-    def _jumped(self, fix: Localized) -> None:
-        self._n_resets += 1
-        self._log.event("jump", f"relocalized with {fix.n_inliers} landmarks")
-
-    def _send(self, frame: Frame, fix: Localized, state: FilterState) -> None:
+        state: FilterState,
+        source: PoseSource,
+        n_matched: int = 0,
+        n_inliers: int = 0,
+    ) -> NotLocalized | None:
+        """Send the pose of a frame, at its own time; or say why it cannot be."""
         sent = self._autopilot.send_pose(
-            state.world_from_body, state.pose_covariance(), frame.captured_at_ns, self._n_resets
+            state.world_from_body,
+            state.pose_covariance(),
+            frame.captured_at_ns,
+            self._estimator.n_resets,
         )
         if not sent:
-            self._refuse(frame, NotLocalized("the pose's covariance is not finite"))
-            return
-        self._health.localized()
-        self._log.frame(
-            frame.sequence,
-            frame.captured_at_ns,
-            "localized",
-            latency_ms=self._latency_ms(frame),
-            matched=fix.n_matched,
-            inliers=fix.n_inliers,
-        )
-        self._answer(frame, "localized")
-
-    def _refuse(self, frame: Frame, why: NotLocalized) -> None:
-        """Send nothing, and say why."""
-        self._health.refused(why.reason)
-        self._log_refused(frame, why)
-
-    def _log_refused(self, frame: Frame, why: NotLocalized) -> None:
-        self._log.frame(
-            frame.sequence,
-            frame.captured_at_ns,
-            "refused",
-            reason=why.reason,
-            latency_ms=self._latency_ms(frame),
-            matched=why.n_matched,
-            inliers=why.n_inliers,
-        )
-        _log.debug("frame %d: %s", frame.sequence, why.reason)
-        self._answer(frame, "refused")
+            return NotLocalized("the pose's covariance is not finite", n_matched, n_inliers)
+        self._outcomes.sent(frame, source, n_matched, n_inliers)
+        return None
 
     def _drop(self, frame: Frame) -> None:
         """Answer a frame whose place a newer one took before it was looked at."""
         if self._maps.current is None:
-            self._refuse(frame, self._no_map())
-            return
-        self._log.frame(frame.sequence, frame.captured_at_ns, "dropped")
-        self._answer(frame, "dropped")
-
-    def _answer(self, frame: Frame, outcome: Outcome) -> None:
-        self._open.remove(frame)
-        self._answered.set()
-        self._camera.done(frame.sequence, outcome)
-
-    def _note_gap(self, frame: Frame) -> None:
-        """Count frames that the camera's driver dropped before us."""
-        if self._last_sequence is not None and frame.sequence > self._last_sequence + 1:
-            self._log.missed(frame.sequence - self._last_sequence - 1)
-        self._last_sequence = frame.sequence
-
-    def _latency_ms(self, frame: Frame) -> float:
-        """From capture to now; in a replay, where capture was long ago, from arrival."""
-        if isinstance(self._clock, ManualClock):
-            return (time.monotonic_ns() - frame.received_at_ns) * 1e-6
-        return (self._clock.now_ns() - frame.captured_at_ns) * 1e-6
+            self._outcomes.refuse(frame, self._no_map())
+        else:
+            self._outcomes.drop(frame)

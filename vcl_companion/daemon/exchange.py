@@ -1,7 +1,7 @@
-"""What peers say, and what is said to them: frames for a first map, and maps.
+"""What peers say, and what is said to them: frames for a first map, maps, and poses.
 
 What comes from peers enters here only, bounded and checked by ``wire`` and
-``swarm``; it can replace the map and nothing else. Nothing is done for a peer
+``swarm``; it can replace the map, propose a pose, and nothing else. Nothing is done for a peer
 while its payload is taken in: what it asks for waits in a mailbox of its own.
 """
 
@@ -9,24 +9,26 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
+from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.first_map import FirstMap
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_answers import FrameAnswers, WantedFrame
 from vcl_companion.daemon.frame_history import FrameHistory
+from vcl_companion.daemon.inter_host import InterHost
+from vcl_companion.daemon.inter_target import InterTarget
 from vcl_companion.daemon.mailbox import PeerMailbox
 from vcl_companion.daemon.map_sharing import MapSharing
 from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.refusals import Refusals
 from vcl_companion.errors import WireError
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.mavlink import Tunnel
@@ -35,6 +37,7 @@ from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.reconstruction import MapOptions, NoMap
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.group import Group, PeerJoined, PeerLost, SwarmOptions
+from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
 from vcl_companion.swarm.transfer import (
     BlobKind,
     BlobReceived,
@@ -46,6 +49,7 @@ from vcl_companion.vision.features import Detector, FeatureOptions
 from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.frame_codec import decode_frame
 from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
+from vcl_companion.wire.pose_messages import PoseProposal, PoseRefused
 from vcl_companion.wire.tunnel import TunnelPayload, decode_payload, encode_payload, is_ours
 
 _log = logging.getLogger(__name__)
@@ -62,6 +66,7 @@ class ExchangeOptions:
     map: MapOptions
     features: FeatureOptions
     detector: Detector
+    inter: InterMavOptions
 
 
 class Exchange:
@@ -77,7 +82,7 @@ class Exchange:
         clock: time base of frames.
         log: told of maps and peers.
         executor: runs map building and indexing.
-        is_localized: whether this drone flies on its map right now.
+        estimator: where this drone is, and whether it knows.
         options: of the steps.
         rng: numbers our requests.
     """
@@ -93,7 +98,7 @@ class Exchange:
         clock: Clock,
         log: FlightLog,
         executor: Executor,
-        is_localized: Callable[[], bool],
+        estimator: Estimator,
         options: ExchangeOptions,
         rng: np.random.Generator,
     ) -> None:
@@ -104,9 +109,10 @@ class Exchange:
         self._clock = clock
         self._log = log
         self._executor = executor
-        self._is_localized = is_localized
+        self._estimator = estimator
         self._options = options
         self._link: PeerLink | None = None
+        self._refusals = Refusals(log)
         self._frames = FrameHistory()
         self._answers = FrameAnswers(
             system_id, self._frames, autopilot, sensor, clock, executor,
@@ -134,22 +140,41 @@ class Exchange:
             log,
             executor,
             self._tell_state,
-            self._count,
+            self._refusals.count,
             options.detector,
             options.features,
+        )
+        self.inter = InterTarget(
+            system_id,
+            HostChoice(group),
+            sensor,
+            clock,
+            executor,
+            self._request_pose,
+            transfers.cancel,
+            options.inter,
+            rng,
+        )
+        self._inter_host = InterHost(
+            maps,
+            self._frames,
+            estimator,
+            self._send,
+            self._refusals.count,
+            sensor,
+            clock,
+            executor,
+            options.features,
+            options.inter,
         )
         self._wake = asyncio.Event()
         self._wanted: PeerMailbox[WantedFrame] = PeerMailbox()
         self._answering: dict[int, int] = {}
-        self._refused: Counter[tuple[int, str]] = Counter()
 
     @property
     def refused(self) -> Mapping[str, int]:
         """What was not accepted from peers so far, counted by kind."""
-        total: Counter[str] = Counter()
-        for (_, kind), times in self._refused.items():
-            total[kind] += times
-        return MappingProxyType(total)
+        return self._refusals.by_kind
 
     def attach(self, link: PeerLink) -> None:
         """Give the link to speak on; the link calls ``on_tunnel`` and ``on_heartbeat``."""
@@ -170,7 +195,7 @@ class Exchange:
         try:
             message = decode_payload(tunnel.payload_type, tunnel.payload)
         except WireError as error:
-            self._count(tunnel.sender_system, "payload", str(error))
+            self._refusals.count(tunnel.sender_system, "payload", str(error))
             return
         self._accept(tunnel.sender_system, message)
         self._wake.set()
@@ -181,6 +206,7 @@ class Exchange:
             parts.create_task(self._first_map.run())
             parts.create_task(self._answer_requests())
             parts.create_task(self._sharing.run())
+            parts.create_task(self._inter_host.run())
             parts.create_task(self._keep_going())
 
     async def _keep_going(self) -> None:
@@ -216,6 +242,9 @@ class Exchange:
             case MapRefused():
                 if peer == self._group.coordinator:
                     self._maps.refuse(message.reason)
+            case PoseProposal() | PoseRefused():
+                if not self.inter.take(peer, message):
+                    self._refusals.count(peer, "pose nobody asked for")
 
     def _take_events(self, events: list[Event]) -> None:
         for event in events:
@@ -224,6 +253,8 @@ class Exchange:
                     self._take_frame(peer, blob)
                 case BlobReceived(peer=peer, kind=BlobKind.MAP, blob=blob):
                     self._sharing.offer(peer, blob)
+                case BlobReceived(peer=peer, kind=BlobKind.POSE_REQUEST, blob=blob):
+                    self._inter_host.offer(peer, blob)
                 case TransferFailed(peer=peer, reason=reason):
                     self._log.event("transfer", f"to drone {peer}: {reason}")
                     _log.warning("transfer to drone %d failed: %s", peer, reason)
@@ -232,10 +263,10 @@ class Exchange:
         try:
             frame = decode_frame(blob)
         except WireError as error:
-            self._count(peer, "frame", str(error))
+            self._refusals.count(peer, "frame", str(error))
             return
         if not self._first_map.take(peer, frame):
-            self._count(peer, "frame nobody asked for")
+            self._refusals.count(peer, "frame nobody asked for")
 
     async def _answer_requests(self) -> None:
         """Send the frames that peers ask for, one after the other; silence when there is none."""
@@ -271,12 +302,16 @@ class Exchange:
             _log.warning("no map: %s", reason)
         self._maps.refuse(reason)
 
+    def _request_pose(self, peer: int, blob: bytes) -> int:
+        self._wake.set()
+        return self._transfers.submit(peer, BlobKind.POSE_REQUEST, blob, self._now_s())
+
     def _tell_state(self) -> None:
         stored = self._maps.current
         state = MapState(
             stored.revision if stored else b"",
             stored.n_landmarks if stored else 0,
-            self._is_localized(),
+            self._estimator.is_localized(self._clock.now_ns()),
         )
         self._group.set_own_state(state)
         self._send(state, 0)
@@ -297,20 +332,11 @@ class Exchange:
             joined = isinstance(event, PeerJoined)
             self._log.event("peer", f"drone {event.peer} {'joined' if joined else 'lost'}")
             _log.info("drone %d %s", event.peer, "joined" if joined else "is silent")
+            if not joined:
+                self.inter.lost(event.peer)
             if joined:
                 self._sharing.forgot(event.peer)
                 self._tell_state()
-
-    def _count(self, peer: int, kind: str, detail: str = "") -> None:
-        """Count what was refused, and tell the log of the first of each kind.
-
-        Only the kind is a key: a detail may hold any number a peer likes.
-        """
-        self._refused[peer, kind] += 1
-        if self._refused[peer, kind] == 1:
-            reason = f"{kind}: {detail}" if detail else kind
-            self._log.event("refused", f"from drone {peer}: {reason}")
-            _log.warning("refused from drone %d: %s", peer, reason)
 
     def _now_s(self) -> float:
         return asyncio.get_running_loop().time()

@@ -7,14 +7,22 @@ import logging
 from collections import Counter
 from contextlib import suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Literal
+
+import numpy as np
 
 from vcl_companion.cameras.source import Outcome
 from vcl_companion.clock import Clock
 from vcl_companion.errors import ConfigError
+from vcl_companion.geometry.pose import Pose, euler_pose_covariance
+from vcl_companion.geometry.rotation import Array
 
 _log = logging.getLogger(__name__)
 
+PoseSource = Literal["intra", "inter", "fused"]
+"""Whence a frame's pose: its own fix, a peer's proposal, or both."""
+
+_UPPER = np.triu_indices(6)
 # Reasons hold numbers, and some are a peer's words: beyond so many they share one count.
 _MAX_REASONS = 200
 _OTHER_REASONS = "other reasons"
@@ -54,6 +62,7 @@ class FlightLog:
         latency_ms: float | None = None,
         matched: int = 0,
         inliers: int = 0,
+        source: PoseSource | None = None,
     ) -> None:
         """Write what became of a frame."""
         self.frames[outcome] += 1
@@ -69,6 +78,40 @@ class FlightLog:
             latency_ms=latency_ms,
             matched=matched,
             inliers=inliers,
+            source=source,
+        )
+
+    def estimate(
+        self,
+        captured_at_ns: int,
+        world_from_body: Pose,
+        covariance: Array,
+        *,
+        fused: bool,
+        host: int | None = None,
+        reason: str = "",
+    ) -> None:
+        """Write what a frame alone, or a peer alone, says of our pose.
+
+        Args:
+            captured_at_ns: the frame's instant.
+            world_from_body: the pose.
+            covariance: (6, 6) local; written as the autopilot gets it.
+            fused: whether the filter took it.
+            host: the peer that proposed it; None for a fix of our own.
+            reason: why the filter did not.
+        """
+        sent = euler_pose_covariance(world_from_body, covariance)
+        self._write(
+            kind="estimate",
+            captured_at_ns=captured_at_ns,
+            source="intra" if host is None else "inter",
+            host=host,
+            position=world_from_body.translation.tolist(),
+            quaternion=world_from_body.quaternion().tolist(),
+            covariance=sent[_UPPER].tolist(),
+            fused=fused,
+            reason=reason or None,
         )
 
     def missed(self, n_frames: int) -> None:

@@ -35,8 +35,10 @@ class FrameHistory:
 
     def nearest(self, at_ns: int) -> Frame | None:
         """Return the frame captured nearest to an instant; None when it is over a second off."""
+        return next(iter(self.near(at_ns)), None)
+
+    def near(self, at_ns: int) -> list[Frame]:
+        """Return the frames captured within a second of an instant, the nearest first."""
         frames = [*self._kept, *([self._newest] if self._newest else [])]
-        found = min(frames, key=lambda f: abs(f.captured_at_ns - at_ns), default=None)
-        if found is None or abs(found.captured_at_ns - at_ns) > _FURTHEST_NS:
-            return None
-        return found
+        near = (f for f in frames if abs(f.captured_at_ns - at_ns) <= _FURTHEST_NS)
+        return sorted(near, key=lambda f: abs(f.captured_at_ns - at_ns))

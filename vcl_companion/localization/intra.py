@@ -121,6 +121,24 @@ class NotLocalized:
     n_inliers: int = 0
 
 
+def disagreement(world_from_body: Array, ned_from_body: Array, options: LocalizationOptions) -> str:
+    """Say how a rotation contradicts the autopilot's attitude; empty when it does not.
+
+    Args:
+        world_from_body: (3, 3) as an image says.
+        ned_from_body: (3, 3) as the autopilot says.
+        options: how much is too much.
+    """
+    tilt = np.rad2deg(np.arccos(np.clip(world_from_body[2] @ ned_from_body[2], -1.0, 1.0)))
+    if tilt > options.max_tilt_deg:
+        return f"disagrees with the autopilot's roll and pitch by {tilt:.0f} degrees"
+    _, _, yaw = euler_from_matrix(world_from_body @ ned_from_body.T)
+    heading = abs(np.rad2deg(yaw))
+    if heading > options.max_heading_deg:
+        return f"disagrees with the autopilot's heading by {heading:.0f} degrees"
+    return ""
+
+
 @dataclass(frozen=True, eq=False)
 class _Matched:
     """One attempt: the matches it made, and what came of them."""
@@ -266,21 +284,10 @@ class _Matcher:
                 n_inliers,
             )
         if ned_from_body is not None:
-            reason = self._disagreement(result.world_from_body.rotation, ned_from_body)
+            reason = disagreement(result.world_from_body.rotation, ned_from_body, self.options)
             if reason:
                 return NotLocalized(reason, n_matched, n_inliers)
         return fix
-
-    def _disagreement(self, world_from_body: Array, ned_from_body: Array) -> str:
-        """Say how a pose contradicts the autopilot's attitude; empty when it does not."""
-        tilt = np.rad2deg(np.arccos(np.clip(world_from_body[2] @ ned_from_body[2], -1.0, 1.0)))
-        if tilt > self.options.max_tilt_deg:
-            return f"disagrees with the autopilot's roll and pitch by {tilt:.0f} degrees"
-        _, _, yaw = euler_from_matrix(world_from_body @ ned_from_body.T)
-        heading = abs(np.rad2deg(yaw))
-        if heading > self.options.max_heading_deg:
-            return f"disagrees with the autopilot's heading by {heading:.0f} degrees"
-        return ""
 
     def _map_error(self, result: Resection, landmarks: NDArray[np.intp]) -> tuple[Array, Array]:
         """Return the pose's (6, 6) covariance by the landmarks' own errors, and its map lever."""

@@ -139,6 +139,29 @@ def started(
     )
 
 
+def started_from_proposal(
+    world_from_body: Pose,
+    covariance: Array,
+    at_ns: int,
+    ned_from_body: Array | None,
+    options: FilterOptions,
+) -> FilterState:
+    """Begin from where a peer says that we were, with unknown speed.
+
+    Args:
+        world_from_body: the proposed pose.
+        covariance: (6, 6) local, of that; the map's error is part of it and can
+            not be told apart, so the next fix brings its own.
+        at_ns: instant of the frame that the proposal is about.
+        ned_from_body: (3, 3) attitude of that instant, or None.
+        options: the filter's.
+    """
+    nothing = np.zeros((6, 6))
+    fix = Localized(world_from_body, covariance, nothing, np.zeros((6, 0)), np.zeros((0, 0)),
+                    0, 0, False, 0.0)  # fmt: skip
+    return started(fix, at_ns, ned_from_body, options)
+
+
 def predict(
     state: FilterState, at_ns: int, ned_from_body: Array | None, options: FilterOptions
 ) -> FilterState | None:
@@ -257,9 +280,9 @@ def fuse(
         arm_m: distance of the scene, to weigh radians against metres.
 
     Returns:
-        The state with the proposal in it; unchanged when the proposal has
-        little to add; or why it is not taken: a pose that the covariances
-        cannot explain at any correlation.
+        The state with the proposal in it, confirmed but not moved when the
+        proposal has little to add; or why it is not taken: a pose that the
+        covariances cannot explain at any correlation.
     """
     own = state.pose_covariance()
     try:
@@ -272,7 +295,10 @@ def fuse(
         return NotFused(f"{metres:.1f} m from where we are, more than both sigmas explain")
     units = np.diag([1.0, 1.0, 1.0, arm_m, arm_m, arm_m]) ** 2
     if np.trace(units @ weighed.covariance) > _NEWS * np.trace(units @ own):
-        return state  # widening what the proposal says nothing of would cost more
+        # Widening what the proposal says nothing of would cost more.
+        return (
+            state if state.fixed_at_ns == state.at_ns else replace(state, fixed_at_ns=state.at_ns)
+        )
     omega = min(max(weighed.omega, _LEAST_OMEGA), 1.0 - _LEAST_OMEGA)
     rotation = state.world_from_body.rotation
     observation = _to_pose(rotation, len(state.covariance))
@@ -296,6 +322,7 @@ def fuse(
         _stepped(state, step),
         covariance=0.5 * (fused + fused.T),
         own_map_covariance=np.zeros((6, 6)),
+        fixed_at_ns=state.at_ns,
     )
 
 

@@ -55,6 +55,16 @@ class PoseHistory:
         """The state after the last frame."""
         return self._steps[-1].state if self._steps else None
 
+    def at(self, at_ns: int) -> FilterState | None:
+        """Return the state after the frame of an instant; None when it is not remembered."""
+        k = self._nearest(at_ns)
+        return None if k is None else self._steps[k].state
+
+    def own_fix_at(self, at_ns: int) -> FilterState | None:
+        """Return the state after the frame of an instant, if the frame gave a fix of its own."""
+        k = self._nearest(at_ns)
+        return None if k is None or self._steps[k].fix is None else self._steps[k].state
+
     def clear(self) -> None:
         """Forget everything: the state has begun anew."""
         self._steps.clear()
@@ -94,9 +104,8 @@ class PoseHistory:
         """
         if not self._steps:
             return NotFused("there is no state to fuse with")
-        k = min(range(len(self._steps)), key=lambda k: abs(self._steps[k].state.at_ns - at_ns))
-        off_ns = at_ns - self._steps[k].state.at_ns
-        if abs(off_ns) > _SAME_INSTANT_NS:
+        k = self._nearest(at_ns)
+        if k is None:
             age_s = (self._steps[-1].state.at_ns - at_ns) * 1e-9
             return NotFused(f"no frame of {age_s:.1f} s ago is remembered")
         fused = fuse(self._steps[k].state, world_from_body, covariance, arm_m)
@@ -114,3 +123,11 @@ class PoseHistory:
         for n, step in enumerate(replayed):
             self._steps[k + n] = step
         return replayed[-1].state
+
+    def _nearest(self, at_ns: int) -> int | None:
+        """Return the place of the step of an instant, None when there is none."""
+        places = range(len(self._steps))
+        k = min(places, key=lambda k: abs(self._steps[k].state.at_ns - at_ns), default=None)
+        if k is None or abs(self._steps[k].state.at_ns - at_ns) > _SAME_INSTANT_NS:
+            return None
+        return k

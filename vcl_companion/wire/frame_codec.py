@@ -48,7 +48,7 @@ class FrameAnswer:
 
     Attributes:
         drone_id: system id of the drone that took it.
-        request_id: of the request this answers.
+        request_id: of the request that it answers, or goes with.
         captured_at_ns: mid-exposure, on that drone's own clock.
         frame_age_s: how old the frame was when it was sent.
         ned_from_body: (4,) unit quaternion w x y z from its autopilot at that
@@ -89,10 +89,18 @@ def encode_frame(frame: FrameAnswer) -> bytes:
     Raises:
         ValueError: the image or the camera is larger than peers accept.
     """
+    return encode_header(BlobKind.FRAME_ANSWER) + encode_frame_body(frame)
+
+
+def encode_frame_body(frame: FrameAnswer) -> bytes:
+    """Return what follows version and kind; a pose request holds the same.
+
+    Raises:
+        ValueError: see ``encode_frame``.
+    """
     attitude = b"" if frame.ned_from_body is None else encode_rotation(frame.ned_from_body)
     return b"".join(
         [
-            encode_header(BlobKind.FRAME_ANSWER),
             _HEAD.pack(
                 frame.drone_id,
                 frame.request_id,
@@ -120,13 +128,19 @@ def decode_frame(data: bytes) -> FrameAnswer:
     if kind != BlobKind.FRAME_ANSWER:
         raise WireError(f"not a frame answer: blob kind {kind}")
     reader = Reader(data, "frame answer", HEADER_BYTES)
+    frame = take_frame_body(reader)
+    reader.finish()
+    return frame
+
+
+def take_frame_body(reader: Reader) -> FrameAnswer:
+    """Return the frame that comes next, or raise WireError."""
     drone_id, request_id, captured_at_ns, age_s, has_attitude = reader.unpack(_HEAD)
     if has_attitude > 1:
         raise WireError(f"frame answer: attitude flag {has_attitude}")
     attitude = take_rotation(reader) if has_attitude else None
     body_from_cam, camera = take_pose(reader), take_camera(reader)
     image_bytes = take_image(reader)
-    reader.finish()
     try:
         return FrameAnswer(
             drone_id,

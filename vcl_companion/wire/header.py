@@ -30,6 +30,8 @@ class PayloadKind(IntEnum):
     FRAME_REQUEST = 3
     MAP_STATE = 4
     MAP_REFUSED = 5
+    POSE_PROPOSAL = 6
+    POSE_REFUSED = 7
 
 
 class BlobKind(IntEnum):
@@ -37,6 +39,7 @@ class BlobKind(IntEnum):
 
     FRAME_ANSWER = 65
     MAP = 66
+    POSE_REQUEST = 67
 
 
 class VersionMismatchError(WireError):

@@ -82,17 +82,12 @@ class MapRefused:
 
     def __post_init__(self) -> None:
         check_request_id(self.request_id)
-        if not self.reason.isprintable():
-            raise ValueError("a reason must be printable")
-        if not 1 <= len(self.reason.encode("utf-8")) <= MAX_REASON_BYTES:
-            raise ValueError(f"a reason has 1 to {MAX_REASON_BYTES} bytes: {self.reason!r}")
+        check_reason(self.reason)
 
     @classmethod
     def because(cls, request_id: int, reason: str) -> MapRefused:
         """Make the message of any text: shortened to fit, what cannot be printed replaced."""
-        text = "".join(c if c.isprintable() else " " for c in reason).strip() or "no reason given"
-        fitting = text.encode("utf-8")[:MAX_REASON_BYTES].decode("utf-8", errors="ignore")
-        return cls(request_id, fitting)
+        return cls(request_id, fitting_reason(reason))
 
 
 def encode_frame_request(message: FrameRequest) -> bytes:
@@ -155,3 +150,17 @@ def check_age(age_s: float) -> None:
     """Raise ValueError unless an age is one: finite, not negative, at most an hour."""
     if not 0.0 <= age_s <= MAX_AGE_S:
         raise ValueError(f"an age of 0 to {MAX_AGE_S:.0f} s: {age_s}")
+
+
+def check_reason(reason: str) -> None:
+    """Raise ValueError unless a reason is one printable line of 1 to 90 bytes."""
+    if not reason.isprintable():
+        raise ValueError("a reason must be printable")
+    if not 1 <= len(reason.encode("utf-8")) <= MAX_REASON_BYTES:
+        raise ValueError(f"a reason has 1 to {MAX_REASON_BYTES} bytes: {reason!r}")
+
+
+def fitting_reason(text: str) -> str:
+    """Return any text as a reason: shortened to fit, what cannot be printed replaced."""
+    printable = "".join(c if c.isprintable() else " " for c in text).strip() or "no reason given"
+    return printable.encode("utf-8")[:MAX_REASON_BYTES].decode("utf-8", errors="ignore")

@@ -32,6 +32,14 @@ from vcl_companion.wire.messages import (
     encode_map_refused,
     encode_map_state,
 )
+from vcl_companion.wire.pose_messages import (
+    PoseProposal,
+    PoseRefused,
+    decode_pose_proposal,
+    decode_pose_refused,
+    encode_pose_proposal,
+    encode_pose_refused,
+)
 
 
 class PayloadType(IntEnum):
@@ -44,7 +52,9 @@ class PayloadType(IntEnum):
     MESSAGE = 33101
 
 
-TunnelPayload = Chunk | TransferStatus | FrameRequest | MapState | MapRefused
+TunnelPayload = (
+    Chunk | TransferStatus | FrameRequest | MapState | MapRefused | PoseProposal | PoseRefused
+)
 
 _DECODERS: dict[int, tuple[PayloadType, Callable[[bytes], TunnelPayload]]] = {
     PayloadKind.CHUNK: (PayloadType.TRANSFER_DATA, decode_chunk),
@@ -52,6 +62,8 @@ _DECODERS: dict[int, tuple[PayloadType, Callable[[bytes], TunnelPayload]]] = {
     PayloadKind.FRAME_REQUEST: (PayloadType.MESSAGE, decode_frame_request),
     PayloadKind.MAP_STATE: (PayloadType.MESSAGE, decode_map_state),
     PayloadKind.MAP_REFUSED: (PayloadType.MESSAGE, decode_map_refused),
+    PayloadKind.POSE_PROPOSAL: (PayloadType.MESSAGE, decode_pose_proposal),
+    PayloadKind.POSE_REFUSED: (PayloadType.MESSAGE, decode_pose_refused),
 }
 
 
@@ -73,6 +85,10 @@ def encode_payload(message: TunnelPayload) -> tuple[PayloadType, bytes]:
             kind, body = PayloadKind.MAP_STATE, encode_map_state(message)
         case MapRefused():
             kind, body = PayloadKind.MAP_REFUSED, encode_map_refused(message)
+        case PoseProposal():
+            kind, body = PayloadKind.POSE_PROPOSAL, encode_pose_proposal(message)
+        case PoseRefused():
+            kind, body = PayloadKind.POSE_REFUSED, encode_pose_refused(message)
     return _DECODERS[kind][0], encode_header(kind) + body
 
 

@@ -1,0 +1,185 @@
+"""What this drone believes of its pose: fixes of its own and peers' proposals, each at its time."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from contextlib import suppress
+
+import numpy as np
+
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.localization.intra import (
+    LocalizationOptions,
+    Localized,
+    NotLocalized,
+    disagreement,
+)
+from vcl_companion.localization.map_index import MapIndex
+from vcl_companion.localization.pose_filter import (
+    FilterOptions,
+    FilterState,
+    NotFused,
+    predict,
+    started,
+    started_from_proposal,
+    update,
+)
+from vcl_companion.localization.pose_history import PoseHistory
+
+# So many fixes in a row that contradict the state are right, and the state is wrong.
+_MAX_CONTRADICTED = 5
+# How far back a proposal may reach; a peer that takes longer speaks of another place.
+HISTORY_S = 5.0
+# A fix this old is no more where we are.
+_FRESH_NS = 2_000_000_000
+_LEAST_ARM_M = 1.0
+
+
+class Estimator:
+    """The pose filter with its recent past; everything happens in the event loop's thread.
+
+    Args:
+        options: of the filter.
+        localization: how far a pose may disagree with the autopilot's attitude.
+        jumped: told of a jump, and of what made it.
+    """
+
+    def __init__(
+        self,
+        options: FilterOptions,
+        localization: LocalizationOptions,
+        jumped: Callable[[str], None],
+    ) -> None:
+        self._options = options
+        self._localization = localization
+        self._jumped = jumped
+        self._history = PoseHistory(HISTORY_S, options)
+        self._n_contradicted = 0
+        self._has_begun = False
+        self._looked_at_ns = -1
+        self._looked = asyncio.Event()
+        self.n_resets = 0
+        self.tracked = 0
+        """Landmarks that agreed in the last frame; 0 when it was refused."""
+
+    def is_localized(self, now_ns: int) -> bool:
+        """Whether a frame of the last two seconds gave a pose, by a fix or by a proposal."""
+        state = self._history.newest
+        return state is not None and now_ns - state.fixed_at_ns <= _FRESH_NS
+
+    def own_fix_at(self, at_ns: int) -> FilterState | None:
+        """Return what was believed at a frame that had a fix of its own; None at any other."""
+        return self._history.own_fix_at(at_ns)
+
+    async def looked_at(self, at_ns: int, within_s: float) -> None:
+        """Wait until the frame of an instant has been looked at, or the time is over."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                while self._looked_at_ns < at_ns:
+                    self._looked.clear()
+                    await self._looked.wait()
+
+    def predicted(self, at_ns: int, ned_from_body: Array | None) -> FilterState | None:
+        """Return the state carried to a frame's instant; None when there is none, or too old."""
+        newest = self._history.newest
+        state = None if newest is None else predict(newest, at_ns, ned_from_body, self._options)
+        if state is None:
+            self._history.clear()
+        return state
+
+    def take_nothing(
+        self, predicted: FilterState | None, at_ns: int, ned_from_body: Array | None
+    ) -> None:
+        """Note a frame without a fix: a proposal may still come for its instant."""
+        self.tracked = 0
+        if predicted is not None:
+            self._history.append(predicted, None, ned_from_body)
+        self._note(at_ns)
+
+    def take_fix(
+        self,
+        predicted: FilterState | None,
+        fix: Localized,
+        at_ns: int,
+        ned_from_body: Array | None,
+    ) -> FilterState | NotLocalized:
+        """Bring the state up to a frame's fix.
+
+        Returns:
+            The state after the frame, or why the fix is not believed; the frame
+            then counts as one without.
+        """
+        state = started(fix, at_ns, ned_from_body, self._options)
+        if predicted is not None:
+            updated = update(predicted, fix)
+            if isinstance(updated, FilterState):
+                if updated.n_jumps > predicted.n_jumps:
+                    self._jump(f"relocalized with {fix.n_inliers} landmarks")
+                state = updated
+            else:
+                # One fix against the state is wrong; several in a row say that the state
+                # is, or that the autopilot has turned its north.
+                self._n_contradicted += 1
+                if self._n_contradicted < _MAX_CONTRADICTED:
+                    self.take_nothing(predicted, at_ns, ned_from_body)
+                    return updated
+                self._jump(f"relocalized with {fix.n_inliers} landmarks")
+                self._history.clear()
+        elif self._has_begun:
+            self._jump(f"relocalized with {fix.n_inliers} landmarks")
+        self._n_contradicted = 0
+        self._has_begun = True
+        self.tracked = fix.n_inliers
+        self._history.append(state, fix, ned_from_body)
+        self._note(at_ns)
+        return state
+
+    def take_proposal(
+        self,
+        at_ns: int,
+        ned_from_body: Array | None,
+        world_from_body: Pose,
+        covariance: Array,
+        index: MapIndex,
+    ) -> FilterState | NotFused:
+        """Take in where a peer says that we were at one of our frames.
+
+        Args:
+            at_ns: the frame's instant.
+            ned_from_body: (3, 3) attitude of that instant, or None.
+            world_from_body: the proposed pose.
+            covariance: (6, 6) local, of it.
+            index: the map that the pose is in, for the distance of the scene.
+
+        Returns:
+            The state of that instant with the proposal in it, or why it was not taken.
+        """
+        if ned_from_body is not None:
+            reason = disagreement(world_from_body.rotation, ned_from_body, self._localization)
+            if reason:
+                return NotFused(reason)
+        if self._history.newest is None:
+            state = started_from_proposal(
+                world_from_body, covariance, at_ns, ned_from_body, self._options
+            )
+            if self._has_begun:
+                self._jump("begun anew by a peer's proposal")
+            self._has_begun = True
+            self._history.append(state, None, ned_from_body)
+            return state
+        points = index.landmark_map.points_world
+        arm_m = float(np.median(np.linalg.norm(points - world_from_body.translation, axis=1)))
+        fused = self._history.fuse(at_ns, world_from_body, covariance, max(arm_m, _LEAST_ARM_M))
+        if isinstance(fused, NotFused):
+            return fused
+        return self._history.at(at_ns) or fused
+
+    def _note(self, at_ns: int) -> None:
+        self._looked_at_ns = at_ns
+        self._looked.set()
+
+    def _jump(self, why: str) -> None:
+        self.n_resets += 1
+        self._jumped(why)

@@ -1,0 +1,209 @@
+"""The host's side of inter-MAV localization (IV-E): where the drone is that took a frame.
+
+The scene does not move, so the host's own frame need not be of the same
+instant: it is the one nearest in time whose pose it believes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Executor
+
+import numpy as np
+
+from vcl_companion.cameras.source import Frame
+from vcl_companion.clock import Clock
+from vcl_companion.daemon.estimator import Estimator
+from vcl_companion.daemon.frame_history import FrameHistory
+from vcl_companion.daemon.mailbox import PeerMailbox
+from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.errors import WireError
+from vcl_companion.geometry.rotation import matrix_from_quaternion
+from vcl_companion.localization.inter import NoProposal, Observer, Proposal, localize_inter
+from vcl_companion.localization.map_index import MapIndex, index_map
+from vcl_companion.localization.pose_filter import FilterState
+from vcl_companion.mapping.drone_view import decode_image
+from vcl_companion.recording.sensor import Sensor
+from vcl_companion.swarm.pose_requests import InterMavOptions
+from vcl_companion.vision.features import FeatureOptions, Features, detect
+from vcl_companion.wire.frame_codec import FrameAnswer
+from vcl_companion.wire.pose_messages import (
+    PoseProposal,
+    PoseRefused,
+    PoseRequest,
+    decode_pose_request,
+)
+
+_log = logging.getLogger(__name__)
+
+# Several targets ask about the same moment: our own features of it are found once.
+_N_KEPT = 3
+# Our own frame of that moment may be being looked at right now.
+_SETTLE_S = 0.5
+
+
+class InterHost:
+    """Answers the targets' requests, one after the other, the newest of each only.
+
+    Args:
+        maps: the current map.
+        frames: our own.
+        estimator: what we believed when these were taken.
+        answer: sends a message to a peer.
+        refuse: counts what a peer sent in vain: peer, kind, detail.
+        sensor: of our camera.
+        clock: time base of frames.
+        executor: runs the vision, beside our own frames'.
+        features: how they are found.
+        options: thresholds.
+    """
+
+    def __init__(
+        self,
+        maps: MapStore,
+        frames: FrameHistory,
+        estimator: Estimator,
+        answer: Callable[[PoseProposal | PoseRefused, int], None],
+        refuse: Callable[[int, str, str], None],
+        sensor: Sensor,
+        clock: Clock,
+        executor: Executor,
+        features: FeatureOptions,
+        options: InterMavOptions,
+    ) -> None:
+        self._maps = maps
+        self._frames = frames
+        self._estimator = estimator
+        self._answer = answer
+        self._refuse = refuse
+        self._clock = clock
+        self._executor = executor
+        self._look = _Look(sensor, features, options)
+        self._requests: PeerMailbox[tuple[int, bytes]] = PeerMailbox()
+
+    def offer(self, peer: int, blob: bytes) -> None:
+        """Take a peer's request; looked at when its turn comes, unless a newer one is there."""
+        self._requests.put(peer, (self._clock.now_ns(), blob))
+
+    async def run(self) -> None:
+        """Answer requests until cancelled."""
+        while True:
+            peer, (came_at_ns, blob) = await self._requests.take()
+            try:
+                request = decode_pose_request(blob)
+                if request.frame.drone_id != peer:
+                    raise WireError(f"the frame of drone {request.frame.drone_id}")
+            except WireError as error:
+                self._refuse(peer, "pose request", str(error))
+                continue
+            self._answer(await self._answer_to(request, came_at_ns), peer)
+
+    async def _answer_to(self, request: PoseRequest, came_at_ns: int) -> PoseProposal | PoseRefused:
+        request_id = request.frame.request_id
+        found = await self._found(request, came_at_ns)
+        if isinstance(found, NoProposal):
+            return PoseRefused.because(request_id, found.reason)
+        try:
+            return PoseProposal.of(
+                request_id, request.revision, found.world_from_body, found.covariance
+            )
+        except ValueError as error:
+            return PoseRefused.because(request_id, str(error))
+
+    async def _found(self, request: PoseRequest, came_at_ns: int) -> Proposal | NoProposal:
+        stored = self._maps.current
+        if stored is None or stored.revision != request.revision:
+            return NoProposal("the host flies on another map")
+        own = await self._own_near(came_at_ns - round(request.frame.frame_age_s * 1e9))
+        if own is None:
+            return NoProposal("the host does not know where it was then")
+        loop = asyncio.get_running_loop()
+        try:
+            return await loop.run_in_executor(
+                self._executor, self._look.from_frame, *own, stored, request.frame
+            )
+        except ValueError as error:
+            return NoProposal(str(error))
+        except Exception as error:
+            # Peers' images and numbers went in: none of them may end the flight.
+            _log.exception("a pose request cannot be worked on")
+            return NoProposal(f"looking failed: {type(error).__name__}")
+
+    async def _own_near(self, at_ns: int) -> tuple[Frame, FilterState] | None:
+        """Return our frame nearest to an instant that had a fix, and what we believed then."""
+        frames = self._frames.near(at_ns)
+        if frames:
+            await self._estimator.looked_at(frames[0].captured_at_ns, _SETTLE_S)
+        for frame in frames:
+            state = self._estimator.own_fix_at(frame.captured_at_ns)
+            if state is not None:
+                return frame, state
+        return None
+
+
+class _Look:
+    """The vision of it; used by the executor's one thread only."""
+
+    def __init__(self, sensor: Sensor, features: FeatureOptions, options: InterMavOptions) -> None:
+        self._sensor = sensor
+        self._features = features
+        self._options = options
+        self._index: tuple[bytes, MapIndex] | None = None
+        self._own: deque[tuple[int, Features]] = deque(maxlen=_N_KEPT)
+
+    def from_frame(
+        self, frame: Frame, state: FilterState, stored: StoredMap, seen: FrameAnswer
+    ) -> Proposal | NoProposal:
+        """Propose where the drone that saw a frame was.
+
+        Args:
+            frame: our own.
+            state: what we believe of its instant.
+            stored: the map of both.
+            seen: the target's frame.
+
+        Raises:
+            ValueError: the target's image cannot be decoded, or the map holds
+                nothing that our detector finds.
+        """
+        image = decode_image(seen.image_bytes, seen.camera)
+        host = Observer(
+            self._own_features(frame),
+            self._sensor.camera,
+            self._sensor.body_from_cam,
+            state.ned_from_body,
+        )
+        attitude = seen.ned_from_body
+        target = Observer(
+            detect(image, self._options.detector, self._features),
+            seen.camera,
+            seen.body_from_cam,
+            None if attitude is None else matrix_from_quaternion(attitude),
+        )
+        return localize_inter(
+            host,
+            state.world_from_body,
+            state.pose_covariance(),
+            target,
+            self._index_of(stored),
+            self._options,
+        )
+
+    def _own_features(self, frame: Frame) -> Features:
+        for sequence, features in self._own:
+            if sequence == frame.sequence:
+                return features
+        found = detect(np.asarray(frame.image), self._options.detector, self._features)
+        self._own.append((frame.sequence, found))
+        return found
+
+    def _index_of(self, stored: StoredMap) -> MapIndex:
+        if stored.index.detector == self._options.detector:
+            return stored.index
+        if self._index is None or self._index[0] != stored.revision:
+            index = index_map(stored.index.landmark_map, self._options.detector, self._features)
+            self._index = (stored.revision, index)
+        return self._index[1]

@@ -1,0 +1,216 @@
+"""The target's side of inter-MAV localization (IV-E): whom to ask, and what to make of answers."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Callable
+from concurrent.futures import Executor
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vcl_companion.cameras.source import Frame
+from vcl_companion.clock import Clock
+from vcl_companion.daemon.estimator import HISTORY_S
+from vcl_companion.geometry.rotation import Array, quaternion_from_matrix
+from vcl_companion.mapping.drone_view import encode_image
+from vcl_companion.recording.sensor import Sensor
+from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
+from vcl_companion.wire.frame_codec import FrameAnswer
+from vcl_companion.wire.pose_messages import (
+    PoseProposal,
+    PoseRefused,
+    PoseRequest,
+    encode_pose_request,
+)
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(eq=False)
+class Asked:
+    """One request, and what has come of it.
+
+    Attributes:
+        request_id: of it.
+        frame: the one that the pose is wanted of.
+        ned_from_body: (3, 3) attitude of its instant, or None.
+        revision: of the map that the pose is wanted in.
+        waiting: hosts that have not answered yet.
+        proposals: host and what it said, not yet handed over.
+    """
+
+    request_id: int
+    frame: Frame
+    ned_from_body: Array | None
+    revision: bytes
+    waiting: set[int]
+    proposals: list[tuple[int, PoseProposal]] = field(default_factory=list)
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def handed_over(self) -> list[tuple[int, PoseProposal]]:
+        """Take the proposals that have come, the surest first."""
+        taken, self.proposals = self.proposals, []
+        return sorted(taken, key=lambda said: _sigma_m(said[1]))
+
+    async def all_answered(self, within_s: float) -> None:
+        """Wait until no answer is owed any more, or the time is over."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                while self.waiting:
+                    self.changed.clear()
+                    await self.changed.wait()
+
+
+class InterTarget:
+    """Asks hosts for our pose, one request at a time; all in the event loop's thread.
+
+    Args:
+        system_id: this drone.
+        hosts: whom to ask.
+        sensor: of our camera.
+        clock: time base of frames.
+        executor: runs the encoding.
+        hand: sends a blob of a request to a peer; returns the transfer's id.
+        cancel: ends a transfer, one that is over already too.
+        options: how often, how many, how long.
+        rng: numbers the requests.
+    """
+
+    def __init__(
+        self,
+        system_id: int,
+        hosts: HostChoice,
+        sensor: Sensor,
+        clock: Clock,
+        executor: Executor,
+        hand: Callable[[int, bytes], int],
+        cancel: Callable[[int], None],
+        options: InterMavOptions,
+        rng: np.random.Generator,
+    ) -> None:
+        self._system_id = system_id
+        self._hosts = hosts
+        self._sensor = sensor
+        self._clock = clock
+        self._executor = executor
+        self._hand = hand
+        self._cancel = cancel
+        self._options = options
+        self._request_id = int(rng.integers(1 << 32))
+        self._n_since = 0
+        self._is_open = False
+        self._asked: dict[int, Asked] = {}
+
+    def begin(
+        self, frame: Frame, ned_from_body: Array | None, revision: bytes, is_lost: bool
+    ) -> Asked | None:
+        """Decide whether a frame is asked about; call ``ask`` with what is returned.
+
+        Args:
+            frame: the newest.
+            ned_from_body: (3, 3) its attitude, or None.
+            revision: of our map.
+            is_lost: it was refused.
+
+        Returns:
+            The request, or None: not due, one is open, or nobody can be asked.
+        """
+        self._n_since += not is_lost
+        every_n = self._options.every_n_frames
+        if every_n == 0 or self._is_open or not (is_lost or self._n_since >= every_n):
+            return None
+        hosts = self._hosts.choose(revision, self._options.max_hosts)
+        if not hosts:
+            return None
+        self._n_since = 0
+        self._is_open = True
+        self._request_id = (self._request_id + 1) % (1 << 32)
+        asked = Asked(self._request_id, frame, ned_from_body, revision, set(hosts))
+        self._asked[asked.request_id] = asked
+        return asked
+
+    async def ask(self, asked: Asked) -> list[tuple[int, PoseProposal]]:
+        """Send the request, and wait until all have answered or ``wait_s`` is over.
+
+        Returns:
+            Host and proposal, the surest first; what comes later, ``stragglers`` has.
+        """
+        transfers = []
+        try:
+            blob = await self._blob(asked)
+            transfers = [self._hand(host, blob) for host in sorted(asked.waiting)]
+            await asked.all_answered(self._options.wait_s)
+        except ValueError as error:
+            asked.waiting.clear()
+            _log.warning("no request for a pose: %s", error)
+        finally:
+            self._is_open = False
+            for transfer_id in transfers:
+                self._cancel(transfer_id)  # a fresher one is coming
+        return asked.handed_over()
+
+    async def stragglers(self, asked: Asked) -> list[tuple[int, PoseProposal]]:
+        """Wait for answers as long as they can still be fused, and forget the request."""
+        try:
+            await asked.all_answered(HISTORY_S)
+            return asked.handed_over()
+        finally:
+            self._asked.pop(asked.request_id, None)
+
+    def take(self, peer: int, answer: PoseProposal | PoseRefused) -> bool:
+        """Take a host's answer; False when it was not asked, or has answered before."""
+        asked = self._asked.get(answer.request_id)
+        if asked is None or peer not in asked.waiting:
+            return False
+        if isinstance(answer, PoseProposal):
+            if answer.revision != asked.revision:
+                return False
+            asked.proposals.append((peer, answer))
+            self._hosts.answered(peer, _sigma_m(answer))
+        else:
+            self._hosts.answered(peer, math.inf)
+            _log.debug("drone %d proposes no pose: %s", peer, answer.reason)
+        self._answered(asked, peer)
+        return True
+
+    def lost(self, peer: int) -> None:
+        """Note that a peer will not answer: it is silent, or the request did not get there."""
+        self._hosts.lost(peer)
+        for asked in self._asked.values():
+            if peer in asked.waiting:
+                self._answered(asked, peer)
+
+    def _answered(self, asked: Asked, peer: int) -> None:
+        asked.waiting.remove(peer)
+        asked.changed.set()
+
+    async def _blob(self, asked: Asked) -> bytes:
+        """Return the encoded request.
+
+        Raises:
+            ValueError: the frame cannot be encoded, or is larger than peers accept.
+        """
+        image_bytes = await asyncio.get_running_loop().run_in_executor(
+            self._executor, encode_image, asked.frame.image, self._options.request_quality
+        )
+        attitude = asked.ned_from_body
+        frame = FrameAnswer(
+            drone_id=self._system_id,
+            request_id=asked.request_id,
+            captured_at_ns=asked.frame.captured_at_ns,
+            frame_age_s=max(self._clock.now_ns() - asked.frame.captured_at_ns, 0) * 1e-9,
+            ned_from_body=None if attitude is None else quaternion_from_matrix(attitude),
+            body_from_cam=self._sensor.body_from_cam,
+            camera=self._sensor.camera,
+            image_bytes=image_bytes,
+        )
+        return encode_pose_request(PoseRequest(asked.revision, frame))
+
+
+def _sigma_m(proposal: PoseProposal) -> float:
+    """Return the position's 1 sigma in its worst direction, m."""
+    return float(np.sqrt(np.linalg.eigvalsh(proposal.covariance[:3, :3])[-1]))

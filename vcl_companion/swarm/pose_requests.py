@@ -1,0 +1,82 @@
+"""Whom a drone asks where it is (inter-MAV localization, IV-E), and how often."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from vcl_companion.localization.inter import InterOptions
+from vcl_companion.swarm.group import Group
+from vcl_companion.vision.features import Detector
+
+
+@dataclass(frozen=True)
+class InterMavOptions(InterOptions):
+    """When peers are asked where we are, and how a host looks for it.
+
+    Attributes:
+        every_n_frames: localized frames from one request to the next; a frame
+            that is refused asks anyway. 0: never asks, still answers.
+        wait_s: a refused frame waits this long for an answer.
+        max_hosts: peers asked at once.
+        detector: features to match two drones' images by; among the map's.
+        request_quality: WebP quality of the frame that is sent, 1 to 100.
+    """
+
+    every_n_frames: int = 10
+    wait_s: float = 1.0
+    max_hosts: int = 2
+    detector: Detector = "sift"
+    request_quality: int = 60
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.every_n_frames <= 100_000:
+            raise ValueError(f"every_n_frames must lie in 0..100000, got {self.every_n_frames}")
+        if not 0 < self.wait_s <= 60.0:
+            raise ValueError(f"wait_s must be above 0 up to 60, got {self.wait_s}")
+        if not 1 <= self.max_hosts <= 16:
+            raise ValueError(f"max_hosts must lie in 1..16, got {self.max_hosts}")
+        if not 1 <= self.request_quality <= 100:
+            raise ValueError(f"request_quality must lie in 1..100, got {self.request_quality}")
+
+
+class HostChoice:
+    """Remembers how sure each peer's last answer was.
+
+    Args:
+        group: who is there, on which map, and localized in it.
+    """
+
+    def __init__(self, group: Group) -> None:
+        self._group = group
+        self._sigma_m: dict[int, float] = {}
+        self._asked_in: dict[int, int] = {}
+        self._n_requests = 0
+
+    def choose(self, revision: bytes, at_most: int) -> list[int]:
+        """Return the peers to ask now for a pose in a map.
+
+        First those that were never asked, then the surest of those who answered,
+        then those who could not tell, the one that was not asked for longest first.
+        """
+        group = self._group
+        able = [
+            peer
+            for peer in group.holders(revision)
+            if peer != group.own_id and (state := group.state_of(peer)) and state.localized
+        ]
+        able.sort(key=lambda p: (self._sigma_m.get(p, 0.0), self._asked_in.get(p, 0), p))
+        chosen = able[:at_most]
+        self._n_requests += 1
+        for peer in chosen:
+            self._asked_in[peer] = self._n_requests
+        return chosen
+
+    def answered(self, peer: int, sigma_m: float) -> None:
+        """Note how sure an answer was; infinite for a peer that could not tell."""
+        self._sigma_m[peer] = sigma_m
+
+    def lost(self, peer: int) -> None:
+        """Forget a peer: when it comes back it is a new one."""
+        self._sigma_m.pop(peer, None)
+        self._asked_in.pop(peer, None)
