@@ -7,33 +7,21 @@ not write them have none; then there is nothing to compare.
 
 from __future__ import annotations
 
-import json
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from sitl.evaluation import Estimates, PoseErrors, covariance_from_upper, pose_errors
+from sitl.flight_log import EstimateRow
 from sitl.processes import FlightError
 from sitl.result import DroneResult, FlightResult
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 
 Source = Literal["intra", "inter"]
-
-
-class _Row(msgspec.Struct, frozen=True):
-    captured_at_ns: int
-    source: Source
-    position: tuple[float, float, float]
-    quaternion: tuple[float, float, float, float]
-    covariance: list[float]
-    fused: bool
-    host: int | None = None
-    reason: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,19 +63,17 @@ class SourceEstimates:
         return np.array(instants, dtype=np.int64), [best[at_ns][1] for at_ns in instants]
 
 
-def read_estimates(flight: FlightResult, drone: DroneResult, out: Path) -> SourceEstimates | None:
-    """Read a drone's estimates by source; None when its log has none, or nothing to compare with.
+def estimates_of(flight: FlightResult, drone: DroneResult) -> SourceEstimates | None:
+    """Return a drone's estimates by source; None when its log has none, or there is no truth.
 
     Args:
         flight: the whole flight, for the alignment and the drones' names.
         drone: whose.
-        out: the flight's output folder.
 
     Raises:
-        FlightError: a line is not what it should be; names file and row.
+        FlightError: an estimate in the log is no pose.
     """
-    path = out / "run" / drone.name / "flight.jsonl"
-    rows = _rows(path)
+    rows: Sequence[EstimateRow] = drone.log.estimates
     if flight.ref_from_world is None or not rows:
         return None
     names = {planned.system_id: planned.name for planned in flight.plan.drones}
@@ -101,7 +87,7 @@ def read_estimates(flight: FlightResult, drone: DroneResult, out: Path) -> Sourc
             else np.empty((0, 21))
         )
     except ValueError as error:
-        raise FlightError(f"{path}: an estimate is no pose ({error})") from error
+        raise FlightError(f"log of {drone.name}: an estimate is no pose ({error})") from error
     at_ns = np.array([row.captured_at_ns for row in rows], dtype=np.int64)
     estimates = Estimates(at_ns, tuple(poses), covariances)
     true = tuple(truth[row.captured_at_ns] for row in rows)
@@ -119,25 +105,7 @@ def nees_median(nees: Array) -> float | None:
     return float(np.median(known)) if len(known) else None
 
 
-def _host(row: _Row, names: dict[int, str]) -> str:
+def _host(row: EstimateRow, names: dict[int, str]) -> str:
     if row.source == "intra" or row.host is None:
         return ""
     return names.get(row.host, f"drone {row.host}")
-
-
-def _rows(path: Path) -> list[_Row]:
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise FlightError(f"{path}: {error.strerror}") from error
-    out = []
-    for number, line in enumerate(lines, start=1):
-        if '"estimate"' not in line:
-            continue
-        try:
-            value = json.loads(line)
-            if value.get("kind") == "estimate":
-                out.append(msgspec.convert(value, _Row))
-        except (ValueError, AttributeError, msgspec.ValidationError) as error:
-            raise FlightError(f"{path}, row {number}: {error}") from error
-    return out
