@@ -147,6 +147,92 @@ def render(scenario: str, out: Path) -> None:
     click.echo(f"recording: {out}")
 
 
+@main.command()
+@click.option("--out", required=True, metavar="DIR", type=_FOLDER, help="Results; made if absent.")
+@click.option(
+    "--only",
+    multiple=True,
+    metavar="NAME",
+    help="rotate, sparse, forward_back, forward_back_near or urban (repeatable); otherwise all.",
+)
+@click.option(
+    "--speed",
+    default="max",
+    show_default=True,
+    metavar="X|max",
+    callback=_speed,
+    help="Seconds of the recording per second, or max: as fast as all daemons keep up.",
+)
+@click.option(
+    "--recordings",
+    metavar="DIR",
+    type=_FOLDER,
+    help="Where rendered scenarios are kept for other runs too; otherwise DIR/recordings.",
+)
+@click.option(
+    "--seconds",
+    type=float,
+    metavar="S",
+    help="Render and fly only the first S seconds: to try it out; nothing is judged then.",
+)
+@click.option(
+    "--start-timeout",
+    default=60.0,
+    show_default=True,
+    metavar="S",
+    help="How long the daemons have to come up, and again to make the first map.",
+)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="SECTION.KEY=VALUE",
+    help="More of the daemons' configuration in every flight (repeatable).",
+)
+def paper(
+    out: Path,
+    only: tuple[str, ...],
+    speed: float,
+    recordings: Path | None,
+    seconds: float | None,
+    start_timeout: float,
+    settings: tuple[str, ...],
+) -> None:
+    """Fly the paper's experiments and lay them beside its figures: paper.html, paper.json.
+
+    Renders each scenario once and flies it with and without fusion where the paper
+    compares: about half an hour. What is finished and still fits is not made again,
+    so the same command goes on after an interruption. Exit status: 0, whatever was
+    measured; 2 for input that cannot be used, 1 when a flight broke off.
+    """
+    from rich.console import Console
+
+    from sitl.paper import PaperOptions, make_paper
+    from sitl.plan import parse_setting
+    from sitl.terminal import progress_shown, show_goals
+
+    options = PaperOptions(
+        only=only,
+        speed=speed,
+        settings=tuple(map(parse_setting, settings)),
+        seconds=seconds,
+        recordings=recordings,
+        start_timeout_s=start_timeout,
+    )
+    console = Console()
+    try:
+        with progress_shown(console) as progress:
+            result = make_paper(
+                out, options, progress, lambda text: console.out(text, highlight=False)
+            )
+    except KeyboardInterrupt:
+        click.echo("sitl: what is finished is kept; the same command goes on from here", err=True)
+        raise
+    show_goals(console, result.goals, out)
+    if result.failures:
+        click.get_current_context().exit(1)
+
+
 @main.group(name="import")
 def import_() -> None:
     """Turn recordings of other makers into ours."""

@@ -46,7 +46,7 @@ def write_report(
             None when it kept no pace.
     """
     report = report_of(result)
-    report["wall"] = _rounded({"start_s": start_s, "flight_s": flight_s, "late_p99_ms": late_ms})
+    report["wall"] = rounded({"start_s": start_s, "flight_s": flight_s, "late_p99_ms": late_ms})
     text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
     (out / "report.json").write_text(text + "\n", encoding="utf-8")
     (out / "report.html").write_text(page(result, report), encoding="utf-8")
@@ -89,7 +89,7 @@ def report_of(result: FlightResult) -> dict[str, Any]:
         "duration_s": duration_s,
     }
     # Options stay exact: whoever repeats the flight needs all of their digits.
-    return {**_rounded(report), "options": report["options"]}
+    return {**rounded(report), "options": report["options"]}
 
 
 def _drone(drone: DroneResult, duration_s: float) -> dict[str, Any]:
@@ -136,12 +136,12 @@ def _percentile(values: Sequence[float], percent: float) -> float | None:
     return float(np.percentile(values, percent)) if values else None
 
 
-def _rounded(value: Any) -> Any:
+def rounded(value: Any) -> Any:
     """Return JSON-like data with floats to six decimals and what is not finite as null."""
     if isinstance(value, dict):
-        return {key: _rounded(inner) for key, inner in value.items()}
+        return {key: rounded(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_rounded(inner) for inner in value]
+        return [rounded(inner) for inner in value]
     if isinstance(value, float):
         return round(value, 6) if math.isfinite(value) else None
     return value

@@ -7,46 +7,11 @@ from html import escape
 from typing import Any
 
 from sitl import report_plots
+from sitl.page_style import document, section
+from sitl.plotting import colour
 from sitl.result import FlightResult
 
 _MAX_EVENTS = 200
-
-_CSS = """
-:root { color-scheme: light; }
-* { box-sizing: border-box; }
-body { margin: 0; background: #f5f7fa; color: #1f2933;
-  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; }
-main { max-width: 1120px; margin: 0 auto; padding: 40px 24px 64px; }
-h1 { font-size: 30px; line-height: 1.2; margin: 0 0 4px; letter-spacing: -0.01em; }
-h2 { font-size: 19px; margin: 0 0 10px; }
-p.lead { color: #52606d; margin: 0 0 24px; }
-p.note { color: #52606d; font-size: 14px; margin: -6px 0 12px; max-width: 78ch; }
-section { background: #fff; border: 1px solid #e4e7eb; border-radius: 10px;
-  padding: 22px 24px; margin-top: 20px; }
-.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(170px, 1fr)); gap: 14px; }
-.tile { background: #fff; border: 1px solid #e4e7eb; border-radius: 10px; padding: 14px 18px; }
-.tile b { display: block; font-size: 26px; line-height: 1.25; font-weight: 650;
-  font-variant-numeric: tabular-nums; }
-.tile span { color: #52606d; font-size: 14px; }
-.bad { color: #b42318; }
-.alarm { border-color: #f3b7b1; background: #fef3f2; }
-.alarm ul { margin: 4px 0 0; padding-left: 20px; }
-table { border-collapse: collapse; width: 100%; font-size: 14.5px;
-  font-variant-numeric: tabular-nums; }
-th, td { padding: 7px 10px; text-align: right; border-bottom: 1px solid #e4e7eb;
-  white-space: nowrap; }
-th { color: #52606d; font-weight: 600; font-size: 13px; }
-th:first-child, td:first-child { text-align: left; padding-left: 0; }
-td.text, th.text { text-align: left; white-space: normal; }
-tr:last-child td { border-bottom: 0; }
-.swatch { display: inline-block; width: 11px; height: 11px; border-radius: 3px;
-  margin-right: 8px; }
-.scroll { overflow-x: auto; }
-svg[role=img] { width: 100%; height: auto; display: block; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: 4px 20px; margin: 0;
-  font-size: 14.5px; }
-dt { color: #52606d; } dd { margin: 0; overflow-wrap: anywhere; }
-"""
 
 _COLUMNS = (
     ("frames", "frames", "{:d}", 1.0),
@@ -73,26 +38,19 @@ def page(result: FlightResult, report: Mapping[str, Any]) -> str:
     """Return the whole page of a flight; ``report`` is what ``report.json`` says."""
     name = escape(str(report["recording"]))
     errors = report_plots.errors_svg(result)
-    sections = [
+    parts = [
         _alarms(report),
-        _section("Where they flew", _flight_note(result), report_plots.trajectories_svg(result)),
-        _section("How well", _SCORE_NOTE, _score_table(report)),
-        _section("Error along every axis", _ERROR_NOTE, errors) if errors else "",
-        _section("Tracked landmarks", "", report_plots.landmarks_svg(result)),
-        _section("Latency and load", _LATENCY_NOTE,
+        section("Where they flew", _flight_note(result), report_plots.trajectories_svg(result)),
+        section("How well", _SCORE_NOTE, _score_table(report)),
+        section("Error along every axis", _ERROR_NOTE, errors) if errors else "",
+        section("Tracked landmarks", "", report_plots.landmarks_svg(result)),
+        section("Latency and load", _LATENCY_NOTE,
                  report_plots.latency_svg(result) + _load_table(report)),
         _refusals(report),
         _events(report),
-        _section("How it was flown", "", _options(report)),
+        section("How it was flown", "", _options(report)),
     ]  # fmt: skip
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{name} · flight report</title>\n<style>{_CSS}</style>\n</head>\n<body>\n<main>\n"
-        f"<h1>{name}</h1>\n<p class=lead>{_lead(report)}</p>\n{_tiles(report)}\n"
-        + "\n".join(filter(None, sections))
-        + "\n</main>\n</body>\n</html>\n"
-    )
+    return document(f"{name} · flight report", name, _lead(report), [_tiles(report), *parts])
 
 
 _SCORE_NOTE = (
@@ -178,7 +136,7 @@ def _drone_table(
     heads = [f"{p} ms" for p in percentiles] + [label for _, label, _, _ in columns]
     rows = []
     for n, (name, drone) in enumerate(report["drones"].items()):
-        swatch = f'<span class=swatch style="background:{report_plots.colour(n)}"></span>'
+        swatch = f'<span class=swatch style="background:{colour(n)}"></span>'
         cells = [_number(drone["latency_ms"][p], "{:.1f}", 1.0) for p in percentiles]
         cells += [_number(drone[key], form, scale) for key, _, form, scale in columns]
         rows.append(
@@ -203,7 +161,7 @@ def _refusals(report: Mapping[str, Any]) -> str:
     if not rows:
         return ""
     head = "<tr><th>drone</th><th>frames</th><th class=text>reason</th></tr>"
-    return _section("Refused frames", "", f"<table>{head}{''.join(rows)}</table>")
+    return section("Refused frames", "", f"<table>{head}{''.join(rows)}</table>")
 
 
 def _events(report: Mapping[str, Any]) -> str:
@@ -222,7 +180,7 @@ def _events(report: Mapping[str, Any]) -> str:
         "<tr><th>time s</th><th class=text>drone</th><th class=text>what</th>"
         "<th class=text>why</th></tr>"
     )
-    return _section("Events", note, f"<table>{head}{''.join(rows)}</table>")
+    return section("Events", note, f"<table>{head}{''.join(rows)}</table>")
 
 
 def _options(report: Mapping[str, Any]) -> str:
@@ -243,8 +201,3 @@ def _options(report: Mapping[str, Any]) -> str:
                      f"{wall['flight_s']:.1f} s" + (f"; frames handed out {late:.1f} ms late (p99)"
                      if late is not None else "")))  # fmt: skip
     return "<dl>" + "".join(f"<dt>{k}</dt><dd>{escape(str(v))}</dd>" for k, v in rows) + "</dl>"
-
-
-def _section(title: str, note: str, content: str) -> str:
-    noted = f"<p class=note>{note}</p>" if note else ""
-    return f"<section>\n<h2>{title}</h2>{noted}{content}\n</section>"

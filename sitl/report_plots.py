@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import io
-import re
 from collections.abc import Sequence
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -14,52 +11,28 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from sitl.evaluation import PoseErrors
+from sitl.plotting import (
+    FAINT,
+    INK,
+    POINT,
+    REFUSED,
+    STYLE,
+    WIDTH_IN,
+    bulk,
+    colour,
+    dotted,
+    seconds,
+    svg,
+)
 from sitl.result import DroneResult, FlightResult
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 
-# Okabe and Ito's colours, told apart by colour-blind readers too; yellow is left out.
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
-_INK, _FAINT, _GRID, _POINT = "#1f2933", "#52606d", "#e4e7eb", "#b8c1cc"
-_REFUSED = "#c0392b"
-
-# Text as outlines of matplotlib's own font: the page must look the same everywhere.
-_STYLE: dict[Any, Any] = {
-    "svg.fonttype": "path",
-    "svg.hashsalt": "sitl",
-    "font.family": "DejaVu Sans",
-    "font.size": 9.5,
-    "text.color": _INK,
-    "axes.edgecolor": "#9aa5b1",
-    "axes.labelcolor": _FAINT,
-    "axes.titlesize": 10.5,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.linewidth": 0.8,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "grid.color": _GRID,
-    "grid.linewidth": 0.8,
-    "xtick.color": _FAINT,
-    "ytick.color": _FAINT,
-    "legend.frameon": False,
-    "lines.solid_capstyle": "round",
-}
-_WIDTH_IN = 11.0
-_MAX_DOTS = 400
-
-
-def colour(n: int) -> str:
-    """Return the colour of the n-th drone."""
-    return _COLOURS[n % len(_COLOURS)]
-
 
 def trajectories_svg(result: FlightResult) -> str:
     """Draw the flight from above (east to the right, north up) and from the side, to scale."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(_WIDTH_IN, 5.6), layout="constrained")
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH_IN, 5.6), layout="constrained")
         above, side = figure.subplots(1, 2)
         _draw_flight(above, result, across=1, up=0, up_sign=1.0)
         _draw_flight(side, result, across=0, up=2, up_sign=-1.0)
@@ -72,7 +45,7 @@ def trajectories_svg(result: FlightResult) -> str:
         figure.legend(
             handles, labels, loc="outside lower center", ncols=len(labels), markerscale=1.6
         )
-        return _svg(figure, "Trajectories from above and from the side")
+        return svg(figure, "Trajectories from above and from the side")
 
 
 def errors_svg(result: FlightResult) -> str | None:
@@ -80,8 +53,8 @@ def errors_svg(result: FlightResult) -> str | None:
     shown = [(n, d) for n, d in enumerate(result.drones) if d.errors is not None]
     if not shown:
         return None
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(_WIDTH_IN, 7.2), layout="constrained")
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH_IN, 7.2), layout="constrained")
         grid = figure.subplots(4, len(shown), sharex=True, sharey="row", squeeze=False)
         for column, (n, drone) in enumerate(shown):
             _draw_errors(list(grid[:, column]), drone, colour(n), result.plan.starts_at_ns)
@@ -90,22 +63,22 @@ def errors_svg(result: FlightResult) -> str | None:
         for row, label in enumerate(("x [cm]", "y [cm]", "z [cm]", "yaw [°]")):
             grid[row, 0].set_ylabel(label)
             _focus_errors(grid[row, 0], shown, row)
-        return _svg(figure, "Error along every axis with the sent 3-sigma band")
+        return svg(figure, "Error along every axis with the sent 3-sigma band")
 
 
 def landmarks_svg(result: FlightResult) -> str:
     """Draw how many landmarks each frame matched and kept; refused and dropped frames marked."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(_WIDTH_IN, 2.9), layout="constrained")
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH_IN, 2.9), layout="constrained")
         axes = figure.subplots(1, len(result.drones), sharey=True, squeeze=False)[0]
         for n, drone in enumerate(result.drones):
             frames = sorted(drone.log.frames, key=lambda frame: frame.captured_at_ns)
-            at_s = _seconds([f.captured_at_ns for f in frames], result.plan.starts_at_ns)
+            at_s = seconds([f.captured_at_ns for f in frames], result.plan.starts_at_ns)
             looked_at = np.array([f.outcome != "dropped" for f in frames], dtype=bool)
             matched = np.array([f.matched for f in frames], dtype=float)
             inliers = np.array([f.inliers for f in frames], dtype=float)
             matched[~looked_at] = inliers[~looked_at] = np.nan
-            axes[n].plot(at_s, matched, color=_POINT, lw=1.2, label="matched")
+            axes[n].plot(at_s, matched, color=POINT, lw=1.2, label="matched")
             axes[n].plot(at_s, inliers, color=colour(n), lw=1.8, label="kept in the pose")
             _mark_outcomes(axes[n], at_s, [f.outcome for f in frames])
             axes[n].set(title=drone.name, xlabel="time [s]", xlim=_time_limits(result))
@@ -115,21 +88,21 @@ def landmarks_svg(result: FlightResult) -> str:
             )  # fmt: skip
         axes[0].set_ylim(bottom=0.0)
         axes[0].set_ylabel("landmarks")
-        return _svg(figure, "Tracked landmarks")
+        return svg(figure, "Tracked landmarks")
 
 
 def latency_svg(result: FlightResult) -> str:
     """Draw every frame's latency in the daemon, and how it is distributed."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(_WIDTH_IN, 2.9), layout="constrained")
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH_IN, 2.9), layout="constrained")
         over_time, share = figure.subplots(1, 2, width_ratios=(2, 1))
         for n, drone in enumerate(result.drones):
             frames = [f for f in drone.log.frames if f.sequence > 0 and f.outcome != "dropped"]
             frames = [frame for frame in frames if frame.latency_ms is not None]
-            at_s = _seconds([f.captured_at_ns for f in frames], result.plan.starts_at_ns)
+            at_s = seconds([f.captured_at_ns for f in frames], result.plan.starts_at_ns)
             latency_ms = np.array([f.latency_ms for f in frames], dtype=float)
             over_time.plot(
-                at_s, latency_ms, _dotted(len(at_s)), ms=4, lw=0.9, color=colour(n),
+                at_s, latency_ms, dotted(len(at_s)), ms=4, lw=0.9, color=colour(n),
                 label=drone.name,
             )  # fmt: skip
             if len(latency_ms):
@@ -145,27 +118,27 @@ def latency_svg(result: FlightResult) -> str:
         share.set(title="Frames done within", xlabel="latency [ms]", ylabel="frames [%]")
         share.set_ylim(0.0, 102.0)
         share.set_xlim(left=0.0)
-        return _svg(figure, "Latency")
+        return svg(figure, "Latency")
 
 
 def _draw_flight(axes: Axes, result: FlightResult, across: int, up: int, up_sign: float) -> None:
-    points = _bulk(result.points_ref_m)
+    points = bulk(result.points_ref_m)
     if len(points):
         axes.plot(
-            points[:, across], up_sign * points[:, up], ".", ms=2.0, color=_POINT, alpha=0.8,
+            points[:, across], up_sign * points[:, up], ".", ms=2.0, color=POINT, alpha=0.8,
             label="map points", zorder=1, rasterized=True,
         )  # fmt: skip
     for n, drone in enumerate(result.drones):
         true = np.array([pose.translation for pose in drone.truth if pose is not None])
         if len(true) and result.ref_from_world is not None:
             axes.plot(
-                true[:, across], up_sign * true[:, up], color=_INK, lw=1.0, dashes=(4, 2),
+                true[:, across], up_sign * true[:, up], color=INK, lw=1.0, dashes=(4, 2),
                 label="truth" if n == 0 else None, zorder=3,
             )  # fmt: skip
         estimated = _estimated_ref_m(result, drone)
         if len(estimated):
             axes.plot(
-                estimated[:, across], up_sign * estimated[:, up], _dotted(len(estimated)),
+                estimated[:, across], up_sign * estimated[:, up], dotted(len(estimated)),
                 ms=4.5, lw=1.4,
                 color=colour(n), label=drone.name, zorder=2,
             )  # fmt: skip
@@ -175,15 +148,6 @@ def _draw_flight(axes: Axes, result: FlightResult, across: int, up: int, up_sign
             )  # fmt: skip
     axes.margins(0.06)
     axes.set_aspect("equal", adjustable="datalim")
-
-
-def _bulk(points: Array) -> Array:
-    """Return the points but for far outliers, which would shrink the flight to a dot."""
-    if len(points) < 10:
-        return points
-    low, high = np.percentile(points, [2.0, 98.0], axis=0)
-    margin = 0.25 * (high - low)
-    return points[np.all((points >= low - margin) & (points <= high + margin), axis=1)]
 
 
 def _estimated_ref_m(result: FlightResult, drone: DroneResult) -> Array:
@@ -199,16 +163,16 @@ def _draw_errors(column: Sequence[Axes], drone: DroneResult, ink: str, starts_at
     if errors is None:
         return
     # At the frames' own instants, so that a frame without a pose breaks the line.
-    at_s = _seconds(drone.frames_at_ns.tolist(), starts_at_ns)
+    at_s = seconds(drone.frames_at_ns.tolist(), starts_at_ns)
     place = np.searchsorted(drone.frames_at_ns, errors.at_ns)
     for row, axes in enumerate(column):
         error, sigma = np.full((2, len(at_s)), np.nan)
         error[place], sigma[place] = _error_and_sigma(errors, row)
         axes.fill_between(at_s, -3 * sigma, 3 * sigma, color=ink, alpha=0.14, lw=0)
         axes.axhline(0.0, color="#9aa5b1", lw=0.8)
-        axes.plot(at_s, error, _dotted(len(at_s)), ms=3.5, lw=1.2, color=ink)
+        axes.plot(at_s, error, dotted(len(at_s)), ms=3.5, lw=1.2, color=ink)
         outside = np.abs(error) > 3 * sigma
-        axes.plot(at_s[outside], error[outside], "o", ms=6, mfc="none", mec=_REFUSED, mew=1.3)
+        axes.plot(at_s[outside], error[outside], "o", ms=6, mfc="none", mec=REFUSED, mew=1.3)
 
 
 def _focus_errors(axes: Axes, shown: Sequence[tuple[int, DroneResult]], row: int) -> None:
@@ -235,7 +199,7 @@ def _error_and_sigma(errors: PoseErrors, row: int) -> tuple[Array, Array]:
 
 def _mark_outcomes(axes: Axes, at_s: Array, outcomes: Sequence[str]) -> None:
     """Put refused and dropped frames at the foot of the plot."""
-    for outcome, mark, ink in (("refused", "x", _REFUSED), ("dropped", "|", _FAINT)):
+    for outcome, mark, ink in (("refused", "x", REFUSED), ("dropped", "|", FAINT)):
         here = at_s[np.array([o == outcome for o in outcomes], dtype=bool)]
         if len(here):
             axes.plot(
@@ -250,27 +214,5 @@ def _time_limits(result: FlightResult) -> tuple[float, float]:
     return -0.03 * duration_s, 1.03 * duration_s
 
 
-def _dotted(n_points: int) -> str:
-    """Return a line style: with a dot at every pose, unless there are too many to be told apart."""
-    return ".-" if n_points <= _MAX_DOTS else "-"
-
-
-def _seconds(at_ns: Sequence[int], starts_at_ns: int) -> Array:
-    """Return instants as seconds of the flight."""
-    return np.asarray((np.array(at_ns, dtype=np.int64) - starts_at_ns) * 1e-9, dtype=np.float64)
-
-
 def _label(axis: str, direction: str, aligned: bool) -> str:
     return f"{axis}, {direction} [m]" if aligned else f"{axis} of world [m]"
-
-
-def _svg(figure: Figure, title: str) -> str:
-    """Return the figure as an ``<svg>`` element that scales with the page."""
-    text = io.StringIO()
-    figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None}, dpi=200)
-    svg = text.getvalue()
-    svg = svg[svg.index("<svg") :]
-    # The width and height would hold the picture at its size on paper.
-    svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
-    svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", svg, count=1)
-    return svg.replace("<svg", f'<svg role="img" aria-label="{title}"', 1)

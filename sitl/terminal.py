@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
 
 from sitl.fly import Progress
+from sitl.paper_goals import Goal
 
 
 @contextmanager
@@ -81,6 +83,20 @@ def show_report(console: Console, report: Mapping[str, Any], out: Path) -> None:
             text = f"ATTENTION {event['drone']}: {event['reason']}"
             console.print(text, style="bold red", markup=False, highlight=False)
     console.print(f"report: {out / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
+
+
+def show_goals(console: Console, goals: Mapping[str, Sequence[Goal]], out: Path) -> None:
+    """Print what had to be shown and whether it was, and where the page is."""
+    for pipeline, rows in goals.items():
+        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+        for title in ("flight", "shows", "goal", pipeline, ""):
+            table.add_column(title)
+        for row in rows:
+            mark = {"met": "[green]met", "not met": "[red]not met"}.get(row.verdict, row.verdict)
+            texts = (row.experiment or "all", row.what, row.goal, row.measured)
+            table.add_row(*(escape(text) for text in texts), mark)
+        console.print(table)
+    console.print(f"page: {out / 'paper.html'}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _number(value: float | None, decimals: int) -> str:
