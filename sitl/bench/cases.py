@@ -141,7 +141,10 @@ def _twin(homography: Array, truth: Pose, a: Array, b: Array) -> Pose | None:
     """
     _, rotations, translations, _ = cv2.decomposeHomographyMat(homography, np.eye(3))
     for rotation, translation in zip(rotations, translations, strict=True):
-        pose = Pose(orthonormalized(np.asarray(rotation)), np.asarray(translation).reshape(3))
+        pose = Pose(
+            orthonormalized(np.asarray(rotation)),
+            np.asarray(translation, dtype=np.float64).reshape(3),
+        )
         turn = float(np.linalg.norm(log_so3(truth.rotation.T @ pose.rotation)))
         if turn > 1e-3 and _share_in_front(pose, a, b) > _TWIN_IN_FRONT:
             return pose

@@ -87,10 +87,7 @@ def read_part(file: Path, stamp: Stamp, scenes: int) -> list[Score] | None:
 def write_part(file: Path, stamp: Stamp, scores: list[Score]) -> None:
     """Keep a finished part; a reader sees all of it or nothing."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    rows = [
-        [s.first, s.among, s.answers, s.turn_deg, s.offset, round(s.milliseconds, 4)]
-        for s in scores
-    ]
+    rows = [[s.first, s.among, s.answers, s.turn_deg, s.offset, s.milliseconds] for s in scores]
     text = json.dumps({"stamp": stamp, "scores": rows}) + "\n"
     fresh = file.with_suffix(".part")
     fresh.write_text(text, encoding="utf-8")
