@@ -296,9 +296,7 @@ def test_covariance_grows_with_the_square_of_the_noise() -> None:
     assert nees(np.full(6, 1e-3), one.noise_covariance)[0] > 0.0
 
 
-@pytest.mark.parametrize(
-    "bad", [{"min_inliers": 5}, {"max_samples": 9}], ids=str
-)
+@pytest.mark.parametrize("bad", [{"min_inliers": 5}, {"max_samples": 9}], ids=str)
 def test_senseless_options_are_errors(bad: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="resection needs"):
         ResectionOptions(**bad)
