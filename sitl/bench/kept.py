@@ -17,28 +17,35 @@ import platform
 from collections.abc import Iterable
 from pathlib import Path
 
+from sitl.bench.cases import Task
 from sitl.bench.trial import Score
 
 Stamp = dict[str, str]
 
 _RIVALS = ("sitl.bench.cases", "sitl.bench.trial", "vcl_companion.geometry.pose")
-_OURS = ("vcl_companion.vision.relative_pose", "vcl_companion.vision.absolute_pose")
+_OURS: dict[Task, str] = {
+    "relative": "vcl_companion.vision.relative_pose",
+    "resection": "vcl_companion.vision.absolute_pose",
+}
 # A change there changes what our search finds, not what a rival does.
 _NOT_OF_RIVALS = "vcl_companion.vision."
 
 
-def stamp_of(contender: str, settings: object) -> Stamp:
+def stamp_of(contender: str, task: Task, settings: object) -> Stamp:
     """Return what a part depends on.
 
     Args:
-        contender: whose part it is; ``ours`` and ``best`` depend on all of our vision.
+        contender: whose part it is; ``ours`` and ``best`` depend on our vision.
+        task: of which only that part matters that does it.
         settings: anything else, by its representation.
     """
     own = contender in ("ours", "best")
-    code = sources_behind((*_RIVALS, *_OURS) if own else _RIVALS, "" if own else _NOT_OF_RIVALS)
+    code = sources_behind(_RIVALS, _NOT_OF_RIVALS)
+    if own:
+        code += sources_behind([_OURS[task]])
     code.append(Path(__file__).with_name("contenders.py"))
     digest = hashlib.sha256()
-    for file in sorted(code):
+    for file in sorted(set(code)):
         digest.update(ast.dump(ast.parse(file.read_text(encoding="utf-8"))).encode())
     libraries = ["numpy", "opencv-python-headless"]
     libraries += ["numba", "scipy"] if own else ["poselib"] if "poselib" in contender else []

@@ -75,9 +75,16 @@ def bench_robust(
     settings = {"seeds": seeds, "threshold_px": THRESHOLD_PX, "told_sigmas": TOLD_SIGMAS}
     rows: dict[tuple[Cell, str], Row] = {}
     missing: list[_Part] = []
-    stamps = {part.name: stamp_of(part.name, (THRESHOLD_PX, TOLD_SIGMAS)) for part in parts}
+    stamps = {
+        (part.name, part.cell.task): stamp_of(
+            part.name, part.cell.task, (THRESHOLD_PX, TOLD_SIGMAS)
+        )
+        for part in parts
+    }
     for part in parts:
-        scores = read_part(out / "robust" / part.file_name, stamps[part.name], part.scenes)
+        scores = read_part(
+            out / "robust" / part.file_name, stamps[part.name, part.cell.task], part.scenes
+        )
         if scores is None:
             missing.append(part)
         else:
@@ -91,7 +98,7 @@ def bench_robust(
     for part in missing:
         progress(f"{part.cell.name} {part.name}", len(rows), len(parts))
         scores = part.run()
-        write_part(out / "robust" / part.file_name, stamps[part.name], scores)
+        write_part(out / "robust" / part.file_name, stamps[part.name, part.cell.task], scores)
         rows[part.cell, part.name] = row_of(part.cell, part.name, scores)
         write_robust(out, settings, finished(), len(parts) - len(rows))
     progress("robust", len(parts), len(parts))

@@ -153,11 +153,13 @@ def test_our_parts_depend_on_all_of_our_vision_and_a_rival_s_on_none() -> None:
     assert files >= {"relative_pose.py", "acransac.py", "five_point.py", "pose.py", "rotation.py"}
     without = sources_behind(["sitl.bench.trial"], "vcl_companion.vision.")
     assert {path.parent.name for path in without} == {"bench", "geometry"}
-    ours, rival = stamp_of("ours", 1), stamp_of("poselib, told", 1)
+    ours, rival = (stamp_of(name, "relative", 1) for name in ("ours", "poselib, told"))
     assert ours["code"] != rival["code"]
     assert "poselib" in rival
     assert "poselib" not in ours
-    assert stamp_of("ours", 1) == ours != stamp_of("ours", 2)
+    assert stamp_of("ours", "relative", 1) == ours != stamp_of("ours", "relative", 2)
+    assert stamp_of("ours", "resection", 1)["code"] != ours["code"]
+    assert stamp_of("poselib, told", "resection", 1) == rival
 
 
 def of(contender: str, cell: Cell, success: float, among: float) -> Row:
