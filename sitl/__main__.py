@@ -1,10 +1,11 @@
-"""The command ``python -m sitl``: render scenes, import recordings, fly them."""
+"""The command ``python -m sitl``: render scenes, import recordings, fly them, measure."""
 
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 
@@ -231,6 +232,41 @@ def paper(
     show_goals(console, result.goals, out)
     if result.failures:
         click.get_current_context().exit(1)
+
+
+@main.command()
+@click.argument(
+    "what", metavar="[steps|robust]", default="steps", type=click.Choice(["steps", "robust"])
+)
+@click.option(
+    "--only", multiple=True, metavar="NAME", help="A step or cell, or part of a name (repeatable)."
+)
+@click.option(
+    "--seeds", type=click.IntRange(min=1), help="Scenes in each cell of robust; 200 by default."
+)
+@click.option("--quick", is_flag=True, help="Seconds: see that it runs, not how well.")
+@click.option("--out", default=Path("out/bench"), show_default=True, metavar="DIR", type=_FOLDER)
+def bench(
+    what: Literal["steps", "robust"],
+    only: tuple[str, ...],
+    seeds: int | None,
+    quick: bool,
+    out: Path,
+) -> None:
+    """Measure each step, or how well poses are found, beside OpenCV, SciPy and poselib.
+
+    steps: the time of each step and whether its answer is right, in minutes.
+    robust: poses among wrong matches, cell by cell, in hours; what is finished is
+    kept in the output folder and not run again.
+    """
+    # One thread for everybody: this counts before numpy is loaded.
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    from rich.console import Console
+
+    from sitl.bench.command import BenchOptions, run_bench
+
+    run_bench(out, BenchOptions(what, only, seeds, quick), Console())
 
 
 @main.group(name="import")

@@ -47,13 +47,13 @@ def test_lines_are_as_specified(tmp_path: Path) -> None:
     log.close(**SUMMARY)
     assert lines(path)[:-1] == before_the_end == [
         {"kind": "frame", "sequence": 0, "captured_at_ns": 100, "outcome": "localized",
-         "reason": None, "latency_ms": 12.5, "matched": 40, "inliers": 30},
+         "reason": None, "latency_ms": 12.5, "matched": 40, "inliers": 30, "source": None},
         {"kind": "frame", "sequence": 1, "captured_at_ns": 200, "outcome": "refused",
-         "reason": "fog", "latency_ms": 8.0, "matched": 3, "inliers": 0},
+         "reason": "fog", "latency_ms": 8.0, "matched": 3, "inliers": 0, "source": None},
         {"kind": "frame", "sequence": 2, "captured_at_ns": 300, "outcome": "dropped",
-         "reason": None, "latency_ms": None, "matched": 0, "inliers": 0},
+         "reason": None, "latency_ms": None, "matched": 0, "inliers": 0, "source": None},
         {"kind": "frame", "sequence": 3, "captured_at_ns": 400, "outcome": "refused",
-         "reason": "fog", "latency_ms": 9.0, "matched": 0, "inliers": 0},
+         "reason": "fog", "latency_ms": 9.0, "matched": 0, "inliers": 0, "source": None},
         {"kind": "event", "at_ns": 42, "event": "lost", "reason": "fog \u2601"},
         {"kind": "map", "at_ns": 42, "revision": "0001020304050607", "parent": "",
          "landmarks": 120, "bytes": 4567, "keyframes": 3},

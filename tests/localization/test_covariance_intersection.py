@@ -23,13 +23,21 @@ def somewhere(rng: np.random.Generator) -> Pose:
     return Pose(exp_so3(rng.uniform(-2.0, 2.0, 3)), rng.uniform(-20.0, 20.0, 3))
 
 
-@given(SEEDS)
-def test_fused_is_never_below_the_true_covariance_for_any_correlation(seed: int) -> None:
+@given(SEEDS, st.sampled_from(["some", "none", "whole", "same", "opposite"]))
+def test_fused_is_never_below_the_true_covariance_for_any_correlation(
+    seed: int, correlation: str
+) -> None:
     rng = np.random.default_rng(seed)
     first, second = covariance(rng), covariance(rng)
     # Any admissible cross-covariance: L1 K L2^T with a contraction K.
     contraction = rng.normal(size=(6, 6))
-    contraction *= rng.uniform(0.0, 1.0) / np.linalg.norm(contraction, 2)
+    if correlation == "some":
+        contraction *= rng.uniform(0.0, 1.0) / np.linalg.norm(contraction, 2)
+    elif correlation == "whole":
+        # Either error tells the other: the edge of what is possible.
+        contraction, _ = np.linalg.qr(contraction)
+    else:
+        contraction = {"none": 0.0, "same": 1.0, "opposite": -1.0}[correlation] * np.eye(6)
     cross = np.linalg.cholesky(first) @ contraction @ np.linalg.cholesky(second).T
     pose = somewhere(rng)
     fused = intersect(pose, first, pose, second, arm_m=10.0)

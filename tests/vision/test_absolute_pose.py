@@ -151,8 +151,8 @@ def test_agrees_with_pycolmap(seed: int) -> None:
     assert off[0] < off[1] + 0.03
 
 
-@pytest.mark.parametrize("name", ["fountain-P11", "Herz-Jesus-P8"])
-def test_agrees_with_pycolmap_and_the_truth_on_photographs(name: str) -> None:
+@pytest.mark.parametrize("name", ["demo", "fountain-P11", "Herz-Jesus-P8"])
+def test_agrees_with_pycolmap_and_the_truth_on_images(name: str) -> None:
     pycolmap = pytest.importorskip("pycolmap", exc_type=ImportError)
     lens, poses, ideal = photographed(name, 3)
     landmarks = poses[0].apply(

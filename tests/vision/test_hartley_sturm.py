@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 from tests.scenes import random_rotation
+from tests.vision.photographs import photographed
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, skew
 from vcl_companion.vision.hartley_sturm import corrected_matches, triangulate_optimal
@@ -54,6 +55,19 @@ def test_agrees_with_opencv(motion: str) -> None:
     for mine, other in zip(ours, theirs, strict=True):
         assert np.abs(mine - other).max() < 1e-6
     assert np.max(cost(a, b, *ours) - cost(a, b, *theirs)) < 1e-11
+
+
+@pytest.mark.parametrize("name", ["demo", "fountain-P11"])
+def test_agrees_with_opencv_on_images(name: str) -> None:
+    """Wrong matches far off their epipolar lines among them."""
+    _, poses, ideal = photographed(name, 2)
+    a, b = np.moveaxis(ideal[np.isfinite(ideal).all(axis=(1, 2))], 1, 0)
+    assert len(a) > 300
+    pose = poses[1].inverse() @ poses[0]
+    ours = corrected_matches(pose, a, b)
+    theirs = [side[0] for side in cv2.correctMatches(essential(pose), a[None], b[None])]
+    for mine, other in zip(ours, theirs, strict=True):
+        assert np.abs(mine - other).max() < 1e-6
 
 
 @pytest.mark.parametrize("motion", MOTIONS)

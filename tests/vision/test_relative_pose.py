@@ -47,6 +47,11 @@ def errors_deg(found: Pose, truth: Pose) -> tuple[float, float]:
     return float(np.rad2deg(turn)), float(np.rad2deg(np.arccos(np.clip(along, -1.0, 1.0))))
 
 
+def near(found: Pose, truth: Pose, turn_deg: float, direction_deg: float) -> bool:
+    turn, direction = errors_deg(found, truth)
+    return turn < turn_deg and direction < direction_deg
+
+
 def test_without_noise_the_pose_is_exact() -> None:
     a, b, truth = two_views(1, 6.0, 0.0)
     found = essential_candidates(a, b, FOCAL_PX, np.random.default_rng(0))
@@ -66,7 +71,7 @@ def test_threshold_and_noise_are_found(noise_px: float, outliers: float) -> None
         assert turn < 1.0 * max(noise_px, 0.3)
         assert 1e-4 < direction < 6.0 * max(noise_px, 0.3)
         assert 0.7 * noise_px < best.sigma_px < 1.4 * noise_px
-        assert 1.2 * noise_px < best.threshold_px < 3.5 * noise_px
+        assert 1.1 * noise_px < best.threshold_px < 3.5 * noise_px
         assert best.log_nfa < 0.0
         assert best.inliers.sum() > 0.8 * (1.0 - outliers) * N
 
@@ -91,7 +96,7 @@ def test_a_plane_shows_both_twins() -> None:
         a, b, truth = two_views(seed, 0.0, 0.5, 0.3)
         found = essential_candidates(a, b, FOCAL_PX, np.random.default_rng(seed))
         errors = [errors_deg(candidate.b_from_a, truth) for candidate in found]
-        assert min(errors) < (0.5, 5.0)
+        assert any(near(candidate.b_from_a, truth, 0.5, 5.0) for candidate in found)
         twins = [turn for turn, _ in errors if turn > 3.0]
         both += bool(twins)
         assert len(found) <= 5
@@ -102,7 +107,7 @@ def test_a_scene_with_depth_has_one_pose_that_is_much_better_than_any_other() ->
     for seed in range(5):
         a, b, truth = two_views(seed, 6.0, 0.5, 0.3)
         found = essential_candidates(a, b, FOCAL_PX, np.random.default_rng(seed))
-        assert errors_deg(found[0].b_from_a, truth) < (0.5, 5.0)
+        assert near(found[0].b_from_a, truth, 0.5, 5.0)
         assert all(other.log_nfa > 0.5 * found[0].log_nfa for other in found[1:])
 
 
@@ -130,46 +135,59 @@ def test_the_same_generator_gives_the_same_candidates() -> None:
     )
 
 
-def test_agrees_with_pycolmap() -> None:
+def by_pycolmap(a: Array, b: Array) -> tuple[Pose, int]:
+    """Return their b_from_a, refined over their inliers, and how many these are."""
     pycolmap = pytest.importorskip("pycolmap", exc_type=ImportError)
     camera = pycolmap.Camera(
-        model="PINHOLE", width=640, height=480, params=[320.0, 320.0, 320.0, 240.0]
+        model="PINHOLE", width=640, height=480, params=[FOCAL_PX, FOCAL_PX, 320.0, 240.0]
     )
+    pixels = [side * FOCAL_PX + np.array([320.0, 240.0]) for side in (a, b)]
+    options = pycolmap.RANSACOptions(max_error=2.0, max_num_trials=5000, random_seed=1)
+    found = pycolmap.estimate_relative_pose(camera, pixels[0], camera, pixels[1], options)
+    refined = pycolmap.refine_relative_pose(
+        found["cam2_from_cam1"], camera, pixels[0], camera, pixels[1], found["inlier_mask"]
+    )
+    pose = refined["cam2_from_cam1"].matrix()
+    return Pose(pose[:, :3], pose[:, 3] / np.linalg.norm(pose[:, 3])), int(found["num_inliers"])
+
+
+@pytest.mark.parametrize("noise_px", [0.0, 0.5])
+def test_agrees_with_pycolmap_where_all_matches_are_good(noise_px: float) -> None:
+    same = 0
+    for seed in range(4):
+        a, b, _ = two_views(seed, 6.0, noise_px)
+        ours = essential_candidates(a, b, FOCAL_PX, np.random.default_rng(seed))[0]
+        theirs, n_inliers = by_pycolmap(a, b)
+        assert near(ours.b_from_a, theirs, 0.05, 0.2)
+        assert ours.inliers.sum() > 0.95 * n_inliers
+        same += near(ours.b_from_a, theirs, 1e-3, 1e-3)
+    # Now and then the far tail of the noise weighs nothing with us.
+    assert same >= 3
+
+
+def test_is_no_worse_than_pycolmap_among_wrong_matches() -> None:
     for seed in range(4):
         a, b, truth = two_views(seed, 6.0, 0.5, 0.4)
         ours = essential_candidates(a, b, FOCAL_PX, np.random.default_rng(seed))[0]
-        centre = np.array([320.0, 240.0])
-        theirs = pycolmap.estimate_essential_matrix(
-            a * FOCAL_PX + centre, b * FOCAL_PX + centre, camera, camera
-        )
-        pose = theirs["cam2_from_cam1"].matrix()
-        other = Pose(pose[:, :3], pose[:, 3])
-        turn, direction = errors_deg(ours.b_from_a, other)
-        assert turn < 1.0
-        assert direction < 6.0
-        # Theirs is not refined over all inliers.
-        assert errors_deg(ours.b_from_a, truth)[0] < errors_deg(other, truth)[0] + 0.1
+        theirs, n_inliers = by_pycolmap(a, b)
+        # The wrong matches among their inliers pull theirs.
+        assert near(ours.b_from_a, theirs, 1.0, 5.0)
+        assert errors_deg(ours.b_from_a, truth)[0] < errors_deg(theirs, truth)[0] + 0.05
+        assert abs(ours.inliers.sum() - n_inliers) < 0.1 * n_inliers
 
 
-@pytest.mark.parametrize("name", ["fountain-P11", "Herz-Jesus-P8"])
-def test_agrees_with_pycolmap_and_the_truth_on_photographs(name: str) -> None:
-    pycolmap = pytest.importorskip("pycolmap", exc_type=ImportError)
+@pytest.mark.parametrize("name", ["demo", "fountain-P11", "Herz-Jesus-P8"])
+def test_agrees_with_pycolmap_and_the_truth_on_images(name: str) -> None:
     lens, poses, ideal = photographed(name, 2)
     both = np.isfinite(ideal).all(axis=(1, 2))
     a, b = ideal[both, 0], ideal[both, 1]
     truth = poses[1].inverse() @ poses[0]
     ours = essential_candidates(a, b, lens.focal_px, np.random.default_rng(0))[0]
-    turn, direction = errors_deg(ours.b_from_a, truth)
-    assert turn < 0.5
-    assert direction < 2.0
-    camera = pycolmap.Camera(
-        model="PINHOLE", width=640, height=427, params=[lens.focal_px] * 2 + [320.0, 213.5]
-    )
-    pixels = [side * lens.focal_px + (320.0, 213.5) for side in (a, b)]
-    theirs = pycolmap.estimate_essential_matrix(*pixels, camera, camera)
-    pose = theirs["cam2_from_cam1"].matrix()
-    assert errors_deg(ours.b_from_a, Pose(pose[:, :3], pose[:, 3])) < (2.0, 10.0)
-    assert ours.inliers.sum() > 0.5 * theirs["num_inliers"]
+    assert near(ours.b_from_a, truth, 0.2, 0.5)
+    theirs, n_inliers = by_pycolmap(a, b)
+    assert near(ours.b_from_a, theirs, 1.0, 5.0)
+    assert errors_deg(ours.b_from_a, truth)[0] < errors_deg(theirs, truth)[0] + 0.05
+    assert ours.inliers.sum() > 0.8 * n_inliers
 
 
 def test_slopes_of_the_sampson_distance() -> None:
@@ -202,7 +220,7 @@ def test_one_of_four_poses_has_the_points_in_front() -> None:
     assert sorted(shares)[-2:] == pytest.approx([0.0, 1.0], abs=0.3)
     best = poses[int(np.argmax(shares))]
     assert max(shares) == 1.0
-    assert errors_deg(best, truth) < (1e-4, 1e-3)
+    assert near(best, truth, 1e-4, 1e-3)
 
 
 def test_the_plane_is_found_among_many_wrong_matches() -> None:
@@ -211,8 +229,7 @@ def test_the_plane_is_found_among_many_wrong_matches() -> None:
     assert not isinstance(found, NotFound)
     assert 2.0 < found.threshold_px < 6.0
     assert 40 <= found.inliers.sum() <= 55
-    errors = [errors_deg(pose, truth) for pose in poses_of_homography(found.model)]
-    assert min(errors) < (1.5, 10.0)
+    assert any(near(pose, truth, 1.5, 10.0) for pose in poses_of_homography(found.model))
 
 
 def test_a_plane_whose_camera_only_turned_has_no_pose() -> None:

@@ -31,6 +31,7 @@ from vcl_companion.vision.epipolar import (
 )
 from vcl_companion.vision.five_point import MAX_MODELS, SAMPLE_SIZE, essentials_of_samples
 from vcl_companion.vision.homography import HomographyProblem, poses_of_homography
+from vcl_companion.vision.plane_parallax import plausibility
 
 _ROUNDS = 30
 _ROUNDS_OF_A_REFIT = 6
@@ -40,7 +41,7 @@ _SURE_SIGMAS = 3.0
 # One hypothesis found twice, whatever the noise.
 _SAME_TURN_RAD = np.deg2rad(0.3)
 _SAME_DIRECTION_RAD = np.deg2rad(1.5)
-# Near enough to ask whether it is; and what makes the answer yes: sigmas, or difference of log NFA.
+# Near enough to ask whether it is; and what makes the answer yes: sigmas, or plainly less likely.
 _NEAR_TURN_RAD = np.deg2rad(3.0)
 _NEAR_DIRECTION_RAD = np.deg2rad(15.0)
 _SAME_SIGMAS = 6.0
@@ -59,6 +60,8 @@ class RelativeCandidate:
         log_nfa: natural logarithm of the number of false alarms of its essential
             matrix; negative, unless only a plane makes it meaningful.
         on_plane: it was found from a plane's homography.
+        plausibility: natural logarithm of how much likelier all matches are under it
+            than if all were wrong, the plane counted where there is one.
     """
 
     b_from_a: Pose
@@ -67,6 +70,7 @@ class RelativeCandidate:
     sigma_px: float
     log_nfa: float
     on_plane: bool
+    plausibility: float = -np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,8 +162,8 @@ def essential_candidates(
         options: how long to search.
 
     Returns:
-        Candidates, most meaningful first; empty when the matches are no better
-        than chance. Two with nearly the same log NFA are planar twins: what else
+        Candidates, most plausible first; empty when the matches are no better
+        than chance. Two that are nearly as plausible are planar twins: what else
         is known has to decide.
     """
     # A kernel is compiled once more for arrays that may not be written, and for integers.
@@ -178,8 +182,14 @@ def essential_candidates(
     plane = ac_ransac(HomographyProblem(a, b, focal_px, area), rng, options)
     if not isinstance(plane, NotFound):
         for start in _facing(poses_of_homography(plane.model), a, b, plane.inliers):
-            judged.append(_judged_on_plane(problem, start, plane))
-    return _distinct(problem, [c for c in judged if c.log_nfa < 0.0 or c.on_plane])
+            judged += _judged_on_plane(problem, start, plane)
+    believed = [c for c in judged if c.log_nfa < 0.0 or c.on_plane]
+    near_plane = None
+    # A guess too large only lets more pass for in front than is.
+    sigma = min((c.sigma_px for c in believed), default=1.0)
+    if not isinstance(plane, NotFound):
+        near_plane = (plane.inliers, plane.threshold_px / 2.5)
+    return _distinct(problem, [_weighed(problem, c, near_plane, sigma) for c in believed])
 
 
 def poses_of_essential(essential: Array) -> list[Pose]:
@@ -212,10 +222,7 @@ def _extent_px(a: Array, b: Array, focal_px: float) -> tuple[float, float]:
 
 def _judged(problem: RelativePoseProblem, pose: Pose, sigma_px: float) -> RelativeCandidate:
     essential = skew(pose.translation) @ pose.rotation
-    # Rays that noise alone may have parted meet anywhere: behind is only what surely is.
-    noise = _SURE_SIGMAS * sigma_px / problem.focal_px
-    possible = in_front(pose, problem.a, problem.b) | _parallel(pose, problem.a, problem.b, noise)
-    found = consensus_of(problem, essential, possible=possible)
+    found = consensus_of(problem, essential, possible=_possible(problem, pose, sigma_px))
     return RelativeCandidate(
         pose, found.inliers, found.threshold_px, sigma_px, found.log_nfa, on_plane=False
     )
@@ -223,21 +230,48 @@ def _judged(problem: RelativePoseProblem, pose: Pose, sigma_px: float) -> Relati
 
 def _judged_on_plane(
     problem: RelativePoseProblem, start: Pose, plane: Consensus
-) -> RelativeCandidate:
-    """Refine a pose by the plane's matches alone, and by all; return the more meaningful.
+) -> list[RelativeCandidate]:
+    """Return a plane's pose as it is, refined by the plane's matches alone, and by all.
 
-    A line is a weak witness: among many wrong matches all of them may lead a pose
-    astray that the plane's alone keep. Which of them belong to the plane is known
-    from two dimensions.
+    The first is the best there is where the scene is the plane and nothing else,
+    the last where there is more. A line is a weak witness: among many wrong
+    matches all of them may lead a pose astray that the plane's alone keep.
     """
     own = replace(problem, a=problem.a[plane.inliers], b=problem.b[plane.inliers])
     kept, kept_sigma = own.refined(start, plane.threshold_px)
     free, free_sigma = problem.refined(kept, plane.threshold_px)
-    judged = (_judged(problem, kept, kept_sigma), _judged(problem, free, free_sigma))
-    best = min(judged, key=lambda candidate: candidate.log_nfa)
-    if best.log_nfa < 0.0:
-        return replace(best, on_plane=True)
-    return replace(judged[0], inliers=plane.inliers, threshold_px=plane.threshold_px, on_plane=True)
+    out = []
+    for pose, sigma in ((start, kept_sigma), (kept, kept_sigma), (free, free_sigma)):
+        judged = _judged(problem, pose, sigma)
+        if judged.log_nfa >= 0.0:
+            judged = replace(judged, inliers=plane.inliers, threshold_px=plane.threshold_px)
+        out.append(replace(judged, on_plane=True))
+    return out
+
+
+def _weighed(
+    problem: RelativePoseProblem,
+    candidate: RelativeCandidate,
+    near_plane: tuple[Mask, float] | None,
+    sigma_px: float,
+) -> RelativeCandidate:
+    """Return a candidate with its plausibility; ``sigma_px`` is a first guess of the noise."""
+    pose = candidate.b_from_a
+    gain = plausibility(
+        pose, problem.a, problem.b, problem.focal_px, _possible(problem, pose, sigma_px),
+        near_plane, sigma_px, problem.diagonal_px, problem.area_px2,
+    )  # fmt: skip
+    return replace(candidate, plausibility=gain)
+
+
+def _possible(problem: RelativePoseProblem, pose: Pose, sigma_px: float) -> Mask:
+    """Return (M,) which matches may be right: those that are not surely behind a camera.
+
+    Rays that noise alone may have parted meet anywhere.
+    """
+    noise = _SURE_SIGMAS * sigma_px / problem.focal_px
+    ahead = in_front(pose, problem.a, problem.b)
+    return np.asarray(ahead | _parallel(pose, problem.a, problem.b, noise))
 
 
 def _parallel(b_from_a: Pose, a: Array, b: Array, within: float) -> Mask:
@@ -260,7 +294,7 @@ def _distinct(
 ) -> list[RelativeCandidate]:
     """Drop what is there already; best first."""
     kept: list[RelativeCandidate] = []
-    for candidate in sorted(judged, key=lambda c: c.log_nfa):
+    for candidate in sorted(judged, key=lambda c: -c.plausibility):
         if not any(_same(problem, other, candidate) for other in kept):
             kept.append(candidate)
     return kept
@@ -283,5 +317,5 @@ def _same(
         return False
     step = np.concatenate([turn, tangent(pose.translation.copy()) @ shift])
     information = problem.information(pose, better.sigma_px, better.inliers)
-    lesser = other.log_nfa > better.log_nfa + _LESSER
+    lesser = other.plausibility < better.plausibility - _LESSER
     return lesser or bool(step @ information @ step < _SAME_SIGMAS**2)

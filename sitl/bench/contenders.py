@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -24,6 +25,11 @@ Contender = Callable[[Array, Array, float, float, int], list[Pose]]
 _MAX_SAMPLES = 20000
 _CONFIDENCE = 0.9999
 _NO_DISTORTION = np.zeros(4)
+
+
+def contenders_of(task: Literal["relative", "resection"]) -> dict[str, Contender]:
+    """Return who takes part: poselib only where it is installed."""
+    return relative_contenders() if task == "relative" else resection_contenders()
 
 
 def relative_contenders() -> dict[str, Contender]:
