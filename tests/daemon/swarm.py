@@ -9,21 +9,27 @@ import socket
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from sitl.frame_server import FrameServer
 from tests.daemon import demo
 from tests.daemon.autopilot import Autopilot, autopilot_and_link
 from tests.daemon.waiting import beside, until
 from vcl_companion.cameras.source import Frame
+from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import ManualClock
+from vcl_companion.daemon.companion import Companion, CompanionOptions
 from vcl_companion.daemon.exchange import Exchange, ExchangeOptions
 from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.mavlink import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions
+from vcl_companion.localization.intra import LocalizationOptions
+from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.transfer import (
     BlobKind,
@@ -37,6 +43,8 @@ from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame
 from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
 from vcl_companion.wire.tunnel import PayloadType, decode_payload, encode_payload
+
+_Kind = TypeVar("_Kind", bound="Drone")
 
 MESSAGE, DATA = PayloadType.MESSAGE, PayloadType.TRANSFER_DATA
 COMPANION = 197
@@ -84,7 +92,7 @@ class Drone:
         self.exchange = Exchange(
             system_id, Group(swarm, system_id), Transfers(transfer, rng), self.maps,
             self._autopilot_link, demo.sensor(system_id), clock, self._log, executor,
-            lambda: self.tracked > 0, lambda: self.tracked,
+            lambda: self.tracked > 0, lambda: self.tracked_now(),
             ExchangeOptions(swarm, demo.MAP_OPTIONS, update, demo.FEATURES, "akaze"), rng,
         )  # fmt: skip
         self._link = PeerLink(
@@ -99,6 +107,10 @@ class Drone:
 
     def close(self) -> None:
         self._log.close()
+
+    def tracked_now(self) -> int:
+        """Landmarks that it says it sees: as many as the test wants."""
+        return self.tracked
 
     async def see(self, frame: Frame) -> None:
         """Have the drone take a frame, when its autopilot has measured at that instant."""
@@ -131,10 +143,55 @@ class Drone:
         self.exchange.on_tunnel(tunnel)
 
 
+class Flyer(Drone):
+    """The same with everything from camera to autopilot, so that it sees what it sees."""
+
+    def __init__(self, *parts: Any) -> None:
+        super().__init__(*parts)
+        self.camera = FrameServer(f"mav{self.system_id - 1}")
+        self.companion: Companion | None = None
+
+    def tracked_now(self) -> int:
+        return 0 if self.companion is None else self.companion.tracked
+
+    async def run(self) -> None:
+        sensor = demo.sensor(self.system_id)
+        size_px = (sensor.camera.width_px, sensor.camera.height_px)
+        port = await self.camera.start()
+        source = StreamCamera("127.0.0.1", port, size_px, self._clock)
+        with ThreadPoolExecutor(1) as executor:
+            self.companion = Companion(
+                source, sensor, self._clock, self._autopilot_link, self.maps,
+                self.exchange.on_frame, Health(self._autopilot_link, self._log), self._log,
+                executor, CompanionOptions(demo.FEATURES, LocalizationOptions(), FilterOptions()),
+            )  # fmt: skip
+            try:
+                async with asyncio.TaskGroup() as parts:
+                    parts.create_task(super().run())
+                    parts.create_task(self.companion.read_camera())
+                    parts.create_task(self.companion.run())
+            finally:
+                await source.close()
+                await self.camera.close()
+
+    async def give(self, k: int) -> None:
+        """Hand out the k-th picture, its attitude first; do not wait for its answer."""
+        await self.camera.connected()
+        shot = demo.shot(self.system_id, k)
+        self.autopilot.measure(shot.at_ns, shot.ned_from_body.quaternion())
+        self.camera.give(self.camera.n_given, shot.at_ns, demo.png(shot.image))
+
+    async def fly(self, k: int) -> None:
+        """Hand out the k-th picture and wait until it is answered."""
+        await self.give(k)
+        await self.camera.answered()
+
+
 class Stranger:
     """A member of the swarm that says what a test wants it to."""
 
     def __init__(self, system_id: int, members: tuple[int, ...], peers: PeerOptions) -> None:
+        self.system_id = system_id
         self._link = PeerLink(peers, system_id, frozenset(members), self._hear, lambda _: None)
         self.forget()
         self.messages: asyncio.Queue[FrameRequest | MapState | MapRefused] = asyncio.Queue()
@@ -224,6 +281,28 @@ class Swarm:
         update: UpdateOptions = NO_UPDATES,
         runs: bool = True,
     ) -> Drone:
+        """Start a drone that only talks, and sees what the test says it sees; see ``_start``."""
+        return await self._start(Drone, system_id, flies_on, transfer, update, runs)
+
+    async def fly(
+        self,
+        system_id: int,
+        flies_on: tuple[int, ...] = (),
+        transfer: TransferOptions = FAST,
+        update: UpdateOptions = NO_UPDATES,
+    ) -> Flyer:
+        """Start a drone that flies; see ``_start``."""
+        return await self._start(Flyer, system_id, flies_on, transfer, update, True)
+
+    async def _start(
+        self,
+        kind: type[_Kind],
+        system_id: int,
+        flies_on: tuple[int, ...],
+        transfer: TransferOptions,
+        update: UpdateOptions,
+        runs: bool,
+    ) -> _Kind:
         """Start a drone at the instant of its first frame, flying on the map of some if given."""
         life = await self._stack.enter_async_context(contextlib.AsyncExitStack())
         self._lives[system_id] = life
@@ -236,7 +315,7 @@ class Swarm:
             autopilot_and_link(system_id, clock, shot.at_ns, quaternion)
         )
         log_path = self._path / f"{system_id}-{self._n_started}.jsonl"
-        drone = Drone(
+        drone = kind(
             system_id, self._members, self._peers(system_id), autopilot, clock, executor,
             log_path, transfer, update, self._n_started,
         )  # fmt: skip
@@ -248,14 +327,16 @@ class Swarm:
             await drone.autopilot.states.get()
         return drone
 
-    async def stop(self, drone: Drone) -> None:
+    async def stop(self, drone: Drone | Stranger) -> None:
         """End a drone."""
         await self._lives[drone.system_id].aclose()
 
     async def stranger(self, system_id: int) -> Stranger:
         """Start a member that is played by the test."""
+        life = await self._stack.enter_async_context(contextlib.AsyncExitStack())
+        self._lives[system_id] = life
         stranger = Stranger(system_id, self._members, self._peers(system_id))
-        await self._stack.enter_async_context(beside(stranger.run()))
+        await life.enter_async_context(beside(stranger.run()))
         return stranger
 
     def _peers(self, system_id: int) -> PeerOptions:
