@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision.bundle import Views, linearized, normal_equations, paired
+from vcl_companion.vision.bundle import Views, linearized, normal_equations
+from vcl_companion.vision.schur import eliminated
 
 
 def leverages(views: Views) -> Array:
@@ -26,8 +27,8 @@ def leverages(views: Views) -> Array:
     n, v = views.ideal.shape[:2]
     try:
         system = normal_equations(views, None)
-        coupled = system.cross @ np.linalg.inv(system.point_block)
-        total = system.pose_block - paired(coupled, system.cross)
+        inverse = np.asarray(np.linalg.inv(system.point_block), dtype=np.float64)
+        total = system.pose_block - eliminated(system.cross, inverse, system.seen)
         covariance = np.zeros_like(total)
         covariance[6:, 6:] = np.linalg.inv(total[6:, 6:])
         np.linalg.cholesky(total[6:, 6:])

@@ -10,10 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, skew
+from vcl_companion.vision.schur import eliminated
 
 _MIN_DEPTH_M = 1e-3
 
@@ -73,6 +75,7 @@ class NormalEquations:
         point_block: (N, 3, 3) normal matrix of each point.
         point_rhs: (N, 3) negative gradient.
         cross: (N, 6V, 3) pose-point coupling.
+        seen: (N, V) bool, which view sees which point.
         cost: robust cost, px^2 (distances weighted to the same unit).
     """
 
@@ -81,6 +84,7 @@ class NormalEquations:
     point_block: Array
     point_rhs: Array
     cross: Array
+    seen: NDArray[np.bool_]
     cost: float
 
 
@@ -183,15 +187,8 @@ def normal_equations(views: Views, cauchy_px: float | None) -> NormalEquations:
         cross[seen, block] += np.einsum("nki,nkj->nij", weighted_pose, j_point)
     for known in views.distances:
         cost += _add_distance(views, known, pose_block, pose_rhs)
-    return NormalEquations(pose_block, pose_rhs, point_block, point_rhs, cross, cost)
-
-
-def paired(one: Array, other: Array) -> Array:
-    """Return the (K, L) sum over landmarks of (N, K, 3) times (N, L, 3) transposed."""
-    k, m = one.shape[1], other.shape[1]
-    return np.asarray(
-        one.transpose(1, 0, 2).reshape(k, -1) @ other.transpose(1, 0, 2).reshape(m, -1).T
-    )
+    in_view = np.isfinite(views.ideal[:, :, 0])
+    return NormalEquations(pose_block, pose_rhs, point_block, point_rhs, cross, in_view, cost)
 
 
 def linearized(
@@ -260,10 +257,10 @@ def _solve(system: NormalEquations, damping: float) -> tuple[Array, Array] | Non
     point_block[:, diagonal, diagonal] *= 1.0 + damping
     point_block[:, diagonal, diagonal] += 1e-9
     try:
-        inverse = np.linalg.inv(point_block)
-        coupled = system.cross @ inverse
-        reduced = system.pose_block - paired(coupled, system.cross)
-        rhs = system.pose_rhs - np.einsum("nij,nj->i", coupled, system.point_rhs)
+        inverse = np.asarray(np.linalg.inv(point_block), dtype=np.float64)
+        reduced = system.pose_block - eliminated(system.cross, inverse, system.seen)
+        toward = np.einsum("nij,nj->ni", inverse, system.point_rhs)
+        rhs = system.pose_rhs - np.einsum("nij,nj->i", system.cross, toward)
         free = slice(6, len(rhs))
         damped = reduced[free, free] + damping * np.diag(np.diag(system.pose_block)[free])
         pose_step = np.zeros(len(rhs))
