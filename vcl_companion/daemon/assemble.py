@@ -8,7 +8,6 @@ import resource
 import signal
 import time
 from collections.abc import Coroutine
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from vcl_companion.daemon.exchange import Exchange, ExchangeOptions
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.worker import Worker
 from vcl_companion.errors import VclError
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.peers import PeerLink
@@ -83,8 +83,7 @@ async def _run(config: Config) -> int:
     autopilot = AutopilotLink(config.autopilot, config.system_id, clock)
     health = Health(autopilot, log)
     # Frames never wait for a map that is being built: one thread for each.
-    vision = ThreadPoolExecutor(1, "vision")
-    mapping = ThreadPoolExecutor(1, "mapping")
+    vision, mapping = Worker("vision"), Worker("mapping")
     rng = np.random.default_rng()
     exchange = Exchange(
         config.system_id,
@@ -141,7 +140,7 @@ async def _run(config: Config) -> int:
                 async with asyncio.timeout(_CLOSE_S):
                     await camera.close()
         finally:
-            # What runs is not waited for here; the process ends when it is done.
+            # What still runs is not waited for: an update takes seconds, and nobody wants it.
             vision.shutdown(wait=False, cancel_futures=True)
             mapping.shutdown(wait=False, cancel_futures=True)
             usage = resource.getrusage(resource.RUSAGE_SELF)
