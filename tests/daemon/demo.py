@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vcl_companion.cameras.source import Frame
-from vcl_companion.daemon.map_building import Distances, build_map
+from vcl_companion.daemon.map_building import Distances, build_map, update_map
+from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.localization.map_index import MapIndex, index_map
@@ -23,7 +24,7 @@ from vcl_companion.recording.images import load_image
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.vision.features import FeatureOptions
 from vcl_companion.wire.frame_codec import FrameAnswer
-from vcl_companion.wire.map_codec import decode_map, encode_map
+from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
 
 DEMO = Path(__file__).parents[2] / "sitl" / "recordings" / "demo"
 # One detector: the map is good enough, and made in half a second.
@@ -111,6 +112,21 @@ def encoded_map(*system_ids: int) -> bytes:
     )  # fmt: skip
     assert isinstance(built, LandmarkMap)
     return encode_map(built)
+
+
+@functools.cache
+def encoded_update() -> bytes:
+    """The next revision of the map of 1 and 2, with a later frame of all three."""
+    stored = StoredMap(revision_of(encoded_map(1, 2)), encoded_map(1, 2), map_index(1, 2))
+    frames = [answer(system_id, 12) for system_id in (1, 2, 3)]
+    made = update_map(stored, frames, MAP_OPTIONS, FEATURES)
+    assert isinstance(made, LandmarkMap)
+    return encode_map(made)
+
+
+@functools.cache
+def update_index() -> MapIndex:
+    return index_map(decode_map(encoded_update()), "akaze", FEATURES)
 
 
 @functools.cache

@@ -9,23 +9,29 @@ import socket
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from sitl.frame_server import FrameServer
 from tests.daemon import demo
 from tests.daemon.autopilot import Autopilot, autopilot_and_link
 from tests.daemon.waiting import beside, until
 from vcl_companion.cameras.source import Frame
+from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import ManualClock
+from vcl_companion.daemon.companion import Companion, CompanionOptions
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.exchange import Exchange, ExchangeOptions
 from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.frame_outcomes import FrameOutcomes
+from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.geometry.pose import Pose
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.mavlink import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions
-from vcl_companion.localization.intra import LocalizationOptions
+from vcl_companion.localization.intra import LocalizationOptions, Localized
 from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.pose_requests import InterMavOptions
@@ -44,6 +50,8 @@ from vcl_companion.wire.pose_messages import PoseProposal, PoseRefused
 from vcl_companion.wire.tunnel import PayloadType, decode_payload, encode_payload
 
 Message = FrameRequest | MapState | MapRefused | PoseProposal | PoseRefused
+_Kind = TypeVar("_Kind", bound="Drone")
+
 MESSAGE, DATA = PayloadType.MESSAGE, PayloadType.TRANSFER_DATA
 COMPANION = 197
 INTER = InterMavOptions(detector="akaze")
@@ -110,6 +118,19 @@ class Drone:
     def close(self) -> None:
         self._log.close()
 
+    def track(self, n_landmarks: int) -> None:
+        """Have the drone look at a frame with so many landmarks in it, without one at 0."""
+        at_ns = self._clock.now_ns()
+        predicted = self.estimator.predicted(at_ns, None)
+        if n_landmarks == 0:
+            self.estimator.take_nothing(predicted, at_ns, None)
+            return
+        fix = Localized(
+            Pose.identity(), 1e-4 * np.eye(6), 1e-4 * np.eye(6), np.zeros((6, 0)),
+            np.zeros((0, 0)), n_landmarks, n_landmarks, False, 0.5,
+        )  # fmt: skip
+        self.estimator.take_fix(predicted, fix, at_ns, None)
+
     async def see(self, frame: Frame) -> None:
         """Have the drone take a frame, when its autopilot has measured at that instant."""
         self._clock.advance_to(frame.captured_at_ns)
@@ -141,10 +162,53 @@ class Drone:
         self.exchange.on_tunnel(tunnel)
 
 
+class Flyer(Drone):
+    """The same with everything from camera to autopilot, so that it sees what it sees."""
+
+    def __init__(self, *parts: Any) -> None:
+        super().__init__(*parts)
+        self.camera = FrameServer(f"mav{self.system_id - 1}")
+
+    async def run(self) -> None:
+        sensor = demo.sensor(self.system_id)
+        size_px = (sensor.camera.width_px, sensor.camera.height_px)
+        port = await self.camera.start()
+        source = StreamCamera("127.0.0.1", port, size_px, self._clock)
+        with ThreadPoolExecutor(1) as executor:
+            health = Health(self._autopilot_link, self._log)
+            companion = Companion(
+                source, FrameOutcomes(source, self._clock, health, self._log), sensor,
+                self._autopilot_link, self.maps, self.estimator, self.exchange.inter,
+                self.exchange.on_frame, health, self._log, executor,
+                CompanionOptions(demo.FEATURES, LocalizationOptions()),
+            )  # fmt: skip
+            try:
+                async with asyncio.TaskGroup() as parts:
+                    parts.create_task(super().run())
+                    parts.create_task(companion.read_camera())
+                    parts.create_task(companion.run())
+            finally:
+                await source.close()
+                await self.camera.close()
+
+    async def give(self, k: int) -> None:
+        """Hand out the k-th picture, its attitude first; do not wait for its answer."""
+        await self.camera.connected()
+        shot = demo.shot(self.system_id, k)
+        self.autopilot.measure(shot.at_ns, shot.ned_from_body.quaternion())
+        self.camera.give(self.camera.n_given, shot.at_ns, demo.png(shot.image))
+
+    async def fly(self, k: int) -> None:
+        """Hand out the k-th picture and wait until it is answered."""
+        await self.give(k)
+        await self.camera.answered()
+
+
 class Stranger:
     """A member of the swarm that says what a test wants it to."""
 
     def __init__(self, system_id: int, members: tuple[int, ...], peers: PeerOptions) -> None:
+        self.system_id = system_id
         self._link = PeerLink(peers, system_id, frozenset(members), self._hear, lambda _: None)
         self.forget()
         self.messages: asyncio.Queue[Message] = asyncio.Queue()
@@ -235,6 +299,29 @@ class Swarm:
         update: UpdateOptions = NO_UPDATES,
         runs: bool = True,
     ) -> Drone:
+        """Start a drone that only talks, and sees what the test says it sees; see ``_start``."""
+        return await self._start(Drone, system_id, flies_on, transfer, inter, update, runs)
+
+    async def fly(
+        self,
+        system_id: int,
+        flies_on: tuple[int, ...] = (),
+        transfer: TransferOptions = FAST,
+        update: UpdateOptions = NO_UPDATES,
+    ) -> Flyer:
+        """Start a drone that flies; see ``_start``."""
+        return await self._start(Flyer, system_id, flies_on, transfer, INTER, update, True)
+
+    async def _start(
+        self,
+        kind: type[_Kind],
+        system_id: int,
+        flies_on: tuple[int, ...],
+        transfer: TransferOptions,
+        inter: InterMavOptions,
+        update: UpdateOptions,
+        runs: bool,
+    ) -> _Kind:
         """Start a drone at the instant of its first frame, flying on the map of some if given."""
         life = await self._stack.enter_async_context(contextlib.AsyncExitStack())
         self._lives[system_id] = life
@@ -247,7 +334,7 @@ class Swarm:
             autopilot_and_link(system_id, clock, shot.at_ns, quaternion)
         )
         log_path = self._path / f"{system_id}-{self._n_started}.jsonl"
-        drone = Drone(
+        drone = kind(
             system_id, self._members, self._peers(system_id), autopilot, clock, executor,
             log_path, transfer, inter, update, self._n_started,
         )  # fmt: skip
@@ -259,14 +346,16 @@ class Swarm:
             await drone.autopilot.states.get()
         return drone
 
-    async def stop(self, drone: Drone) -> None:
+    async def stop(self, drone: Drone | Stranger) -> None:
         """End a drone."""
         await self._lives[drone.system_id].aclose()
 
     async def stranger(self, system_id: int) -> Stranger:
         """Start a member that is played by the test."""
+        life = await self._stack.enter_async_context(contextlib.AsyncExitStack())
+        self._lives[system_id] = life
         stranger = Stranger(system_id, self._members, self._peers(system_id))
-        await self._stack.enter_async_context(beside(stranger.run()))
+        await life.enter_async_context(beside(stranger.run()))
         return stranger
 
     def _peers(self, system_id: int) -> PeerOptions:

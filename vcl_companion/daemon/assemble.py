@@ -8,7 +8,6 @@ import resource
 import signal
 import time
 from collections.abc import Coroutine
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.worker import Worker
 from vcl_companion.errors import VclError
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.peers import PeerLink
@@ -88,8 +88,7 @@ async def _run(config: Config) -> int:
     outcomes = FrameOutcomes(camera, clock, health, log)
     estimator = Estimator(config.filter, config.localization, lambda why: log.event("jump", why))
     # Frames never wait for a map that is being built: one thread for each.
-    vision = ThreadPoolExecutor(1, "vision")
-    mapping = ThreadPoolExecutor(1, "mapping")
+    vision, mapping = Worker("vision"), Worker("mapping")
     # Before anybody is told that we are here: no frame has to wait for the compiler.
     notify.status("compiling, once on this machine")
     warm = loop.run_in_executor(vision, warm_up)
@@ -160,7 +159,7 @@ async def _run(config: Config) -> int:
                 async with asyncio.timeout(_CLOSE_S):
                     await camera.close()
         finally:
-            # What runs is not waited for here; the process ends when it is done.
+            # What still runs is not waited for: an update takes seconds, and nobody wants it.
             vision.shutdown(wait=False, cancel_futures=True)
             mapping.shutdown(wait=False, cancel_futures=True)
             usage = resource.getrusage(resource.RUSAGE_SELF)

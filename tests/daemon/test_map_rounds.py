@@ -1,0 +1,333 @@
+"""Maps that are updated in flight, over real links: votes, rounds, everybody on the next one."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.daemon import demo
+from tests.daemon.swarm import Drone, Flyer, swarm
+from tests.daemon.waiting import hurry, run, until
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import matrix_from_euler
+from vcl_companion.swarm.transfer import BlobKind
+from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.wire.frame_codec import encode_frame
+from vcl_companion.wire.map_codec import decode_map, parent_of, revision_of
+from vcl_companion.wire.messages import FrameRequest, MapState
+
+PAIR, TRIO, NEXT = demo.encoded_map(1, 2), demo.encoded_map(1, 2, 3), demo.encoded_update()
+UPDATES = UpdateOptions()
+FEW, PLENTY = 10, 500
+
+
+async def passes(seconds: float) -> None:
+    """Let time pass in small steps, in which everybody says what there is to say."""
+    for _ in range(round(seconds / 0.25)):
+        hurry(0.25)
+        for _ in range(3):
+            await asyncio.sleep(0.002)
+
+
+async def passes_until(condition: Callable[[], bool], at_most_s: float = 60.0) -> None:
+    """Let time pass until something has come true."""
+    for _ in range(round(at_most_s / 0.25)):
+        if condition():
+            return
+        await passes(0.25)
+    assert condition()
+
+
+async def computed(condition: Callable[[], bool]) -> None:
+    """Wait for what takes a processor's time, however busy that is, to a bound."""
+    for _ in range(900):
+        if condition():
+            return
+        hurry(0.0)  # the test's own bound counts from here
+        await asyncio.sleep(0.1)
+    assert condition()
+
+
+def at_once(*drones: Drone, tracked: int) -> None:
+    for drone in drones:
+        drone.track(tracked)
+
+
+async def poses_of(drone: Flyer) -> list[tuple[int, Pose, float]]:
+    """Instant, pose and largest sigma of the position of what its autopilot has been sent."""
+    out = []
+    while not drone.autopilot.poses.empty():
+        fields = drone.autopilot.poses.get_nowait()
+        assert fields[-1] == 0  # reset_counter
+        pose = Pose(matrix_from_euler(*fields[4:7]), np.array(fields[1:4]))
+        variances = np.array(fields[7:28])[[0, 6, 11]]
+        out.append((fields[0] * 1000, pose, float(np.sqrt(variances.max()))))
+    return out
+
+
+def test_a_swarm_in_flight_gets_a_new_map_and_nobody_jumps(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        # On their first map they see over 440 landmarks at first, two of them under 400 later.
+        options = UpdateOptions(tracked=400, share=0.0)
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            drones = [await members.fly(system_id, update=options) for system_id in (1, 2, 3)]
+            one = drones[0]
+            await asyncio.gather(*(drone.fly(0) for drone in drones))
+            first = one.revision
+            assert {drone.revision for drone in drones} == {first}
+            switched_at = 0
+            for k in (6, 12, 18, *range(24, 40, 2)):
+                await asyncio.gather(*(drone.fly(k) for drone in drones))
+                await passes(0.75)
+                if one.events("update") and not switched_at:
+                    await computed(lambda: {first}.isdisjoint(d.revision for d in drones))
+                    switched_at = k
+                if switched_at and k >= switched_at + 6:
+                    break
+            assert 24 <= switched_at < 36
+            assert one.events("update")[0].startswith("wanted by drones 2, 3")
+            second = one.revision
+            for drone in drones:
+                assert drone.revision == second
+                assert [line["parent"] for line in drone.lines("map")] == ["", first.hex()]
+                assert drone.events("jump") == []
+                assert {line["outcome"] for line in drone.lines("frame")} == {"localized"}
+                assert dict(drone.exchange.refused) == {}
+                poses = await poses_of(drone)
+                truth = {
+                    demo.shot(drone.system_id, k).at_ns: demo.world_from_body(drone.system_id, k)
+                    for k in range(40)
+                }
+                errors = np.array(
+                    [pose.translation - truth[at_ns].translation for at_ns, pose, _ in poses]
+                )
+                sigmas = np.array([sigma for _, _, sigma in poses])
+                norms = np.linalg.norm(errors, axis=1)
+                assert 1e-4 < norms.max() < 0.25
+                steps = np.linalg.norm(np.diff(errors, axis=0), axis=1)
+                assert (steps < 4.0 * (sigmas[1:] + sigmas[:-1])).all()
+            seen = decode_map(one.maps.current.data) if one.maps.current else None
+            assert seen is not None
+            assert {keyframe.drone_id for keyframe in seen.keyframes[3:]} <= {1, 2, 3}
+            assert len(seen.keyframes) > 3
+
+    run(scenario())
+
+
+def test_when_the_coordinator_dies_in_a_round_the_next_one_makes_it(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            one, two = [
+                await members.start(system_id, flies_on=(1, 2), update=UPDATES)
+                for system_id in (1, 2)
+            ]
+            three = await members.stranger(3)
+            await three.meets(1, 2)
+            old = revision_of(PAIR)
+            for to in (1, 2):
+                three.say(MapState(old, 1, True, FEW, True), to)
+            await one.see(demo.frame(1, 12))
+            await two.see(demo.frame(2, 12))
+            at_once(one, two, tracked=PLENTY)
+            await passes(8.0)
+            assert one.events("update") == []  # one of three
+            at_once(one, two, tracked=FEW)
+            asked = asyncio.create_task(three.asked())
+            await passes_until(asked.done)
+            assert one.events("update") == ["wanted by drones 1, 2, 3; 3 lost"] or one.events(
+                "update"
+            ) == ["wanted by drones 1, 2, 3"]
+            await members.stop(one)
+            three.heard()
+            await passes_until(lambda: bool(two.events("update")), 30.0)
+            request = await three.asked()
+            answer = encode_frame(demo.answer(3, 12, request.request_id))
+            three.hand(BlobKind.FRAME_ANSWER, answer, 2)
+            await computed(lambda: two.revision != old)
+            received = await three.blobs.get()
+            while revision_of(received.blob) != two.revision:
+                received = await three.blobs.get()
+            assert received.kind == BlobKind.MAP
+            assert parent_of(received.blob) == old
+            drones = [keyframe.drone_id for keyframe in decode_map(received.blob).keyframes]
+            assert drones[:2] == [1, 2]
+            assert set(drones[2:]) == {2, 3}
+
+    run(scenario())
+
+
+def test_who_overlapped_nobody_joins_later_with_several_frames(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            drones = [
+                await members.start(system_id, flies_on=(1, 2), update=UPDATES)
+                for system_id in (1, 2, 3)
+            ]
+            one, two, three = drones
+            at_once(one, two, tracked=PLENTY)
+            at_once(three, tracked=0)
+            for k in range(0, 48, 3):
+                for drone in drones:
+                    await drone.see(demo.frame(drone.system_id, k))
+            await passes(UPDATES.lost_s + 3.0)
+            assert one.events("update") == []
+            at_once(one, two, tracked=FEW)
+            await passes_until(lambda: bool(one.events("update")))
+            await computed(lambda: one.revision == three.revision != revision_of(PAIR))
+            assert one.events("update") == ["wanted by drones 1, 2, 3; 3 lost"]
+            ids = {request.request_id for request in three.requests}
+            assert len(ids) == UPDATES.joiner_frames
+            assert len({request.request_id for request in two.requests}) == 1
+            stored = three.maps.current
+            assert stored is not None
+            mine = [k for k in decode_map(stored.data).keyframes if k.drone_id == 3]
+            assert 2 <= len(mine) <= UPDATES.joiner_frames
+            assert len({keyframe.captured_at_ns for keyframe in mine}) == len(mine)
+            assert dict(one.exchange.refused) == {}
+
+    run(scenario())
+
+
+def test_a_round_without_result_is_said_and_the_old_map_stays(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            one, two = [
+                await members.start(system_id, flies_on=(1, 2), update=UPDATES)
+                for system_id in (1, 2)
+            ]
+            for drone in (one, two):
+                k = drone.system_id
+                await drone.see(demo.frame(k, 12, image=demo.blank(k)))
+            await passes_until(lambda: bool(one.events("update")))
+            await computed(lambda: bool(one.events("no update")))
+            assert len(one.events("update")) == 1
+            assert one.revision == two.revision == revision_of(PAIR)
+            await passes(UPDATES.interval_s + 2.0)
+            assert len(one.events("update")) == 1  # the same frame is not tried again
+            for drone in (one, two):
+                await drone.see(demo.frame(drone.system_id, 14))
+            await passes_until(lambda: len(one.events("update")) == 2)
+            await computed(lambda: one.revision == two.revision != revision_of(PAIR))
+
+    run(scenario())
+
+
+def test_a_frame_that_never_comes_is_not_waited_for_longer_than_said(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            one = await members.start(1, flies_on=(1, 2), update=UPDATES)
+            two = await members.stranger(2)
+            await two.meets(1)
+            await one.see(demo.frame(1, 12))
+            state = MapState(revision_of(PAIR), 1, False, 0, True)
+            two.say(state, 1)
+            await passes_until(lambda: bool(one.events("update")))
+            await passes(UPDATES.gather_timeout_s)
+            await computed(lambda: one.revision != revision_of(PAIR))
+            asked = [message for message in two.heard() if isinstance(message, FrameRequest)]
+            assert 4 <= len(asked) <= 6  # once a second, for as long as said
+            assert len({request.request_id for request in asked}) == 1
+            stored = one.maps.current
+            assert stored is not None
+            drones = [keyframe.drone_id for keyframe in decode_map(stored.data).keyframes]
+            assert drones == [1, 2, 1]
+
+    run(scenario())
+
+
+def test_a_map_that_is_claimed_and_never_comes_is_done_without(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            one, two = await members.start(1, update=UPDATES), await members.stranger(2)
+            await two.meets(1)
+            await one.see(demo.frame(1))
+            claim = MapState(b"nonsense", 1000, True)
+            two.say(claim, 1)
+            await passes(UPDATES.delivery_wait_s - 2.0)
+            assert not any(isinstance(message, FrameRequest) for message in two.heard())
+            asked = asyncio.create_task(two.asked())
+            await passes_until(asked.done, 10.0)
+            answer = encode_frame(demo.answer(2, 0, asked.result().request_id))
+            two.hand(BlobKind.FRAME_ANSWER, answer, 1)
+            await one.maps.decided()
+            assert one.revision != b""
+
+    run(scenario())
+
+
+def test_a_claimed_map_that_is_coming_in_is_waited_for(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            one, two = await members.start(1, update=UPDATES), await members.start(2, (1, 2))
+            await one.see(demo.frame(1))
+            await one.maps.decided()
+            assert one.revision == revision_of(PAIR)
+            assert two.requests == []
+
+    run(scenario())
+
+
+def test_a_map_refused_once_is_taken_when_it_comes_from_the_coordinator(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            three = await members.start(3, flies_on=(1, 2))
+            one, two = await members.stranger(1), await members.stranger(2)
+            for stranger in (one, two):
+                await stranger.meets(3)
+                stranger.say(MapState(revision_of(PAIR), 1, True), 3)
+            two.hand(BlobKind.MAP, TRIO, 3)
+            await until(lambda: bool(three.exchange.refused))
+            assert dict(three.exchange.refused) == {"map, but not from the coordinator": 1}
+            await members.stop(one)
+            await passes(6.0)
+            two.say(MapState(revision_of(TRIO), 1, True), 3)
+            two.forget()
+            two.hand(BlobKind.MAP, TRIO, 3)
+            await passes_until(lambda: three.revision == revision_of(TRIO), 5.0)
+
+    run(scenario())
+
+
+@pytest.mark.parametrize("n_ahead", [1, 2])
+def test_a_coordinator_that_is_back_with_an_old_map_is_brought_up_to_date(
+    n_ahead: int, tmp_path: Path
+) -> None:
+    async def scenario() -> None:
+        ahead = tuple(range(2, 2 + n_ahead))
+        async with swarm(1, *ahead, path=tmp_path) as members:
+            others = [await members.start(system_id, flies_on=(1, 2)) for system_id in ahead]
+            for drone in others:
+                drone.maps.replace(NEXT, demo.update_index())
+            one = await members.start(1, flies_on=(1, 2))
+            await computed(lambda: one.revision == revision_of(NEXT))
+            for drone in others:
+                assert drone.revision == revision_of(NEXT)
+                assert drone.lines("map") == []
+            assert one.lines("map")[0]["parent"] == revision_of(PAIR).hex()
+
+    run(scenario())
+
+
+def test_a_map_that_was_left_is_taken_back_only_from_a_coordinator_that_insists(
+    tmp_path: Path,
+) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            two, one = await members.start(2, (1, 2), update=UPDATES), await members.stranger(1)
+            two.maps.replace(NEXT, demo.update_index())
+            await one.meets(2)
+            one.say(MapState(revision_of(PAIR), 1, True), 2)
+            one.hand(BlobKind.MAP, PAIR, 2)
+            await until(lambda: bool(two.exchange.refused))
+            assert dict(two.exchange.refused) == {"map that was left": 1}
+            assert (await one.blobs.get()).blob == NEXT  # it is handed ours
+            await passes(UPDATES.delivery_wait_s)
+            one.forget()
+            one.hand(BlobKind.MAP, PAIR, 2)
+            await computed(lambda: two.revision == revision_of(PAIR))
+
+    run(scenario())

@@ -1,0 +1,67 @@
+"""A thread for heavy work that does not hold the process when the service ends."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from queue import Empty, SimpleQueue
+from typing import Any, ParamSpec, TypeVar
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+_Work = tuple["Future[Any]", Callable[[], Any]]
+
+
+class Worker(Executor):
+    """Does one thing after the other, in one thread.
+
+    The standard library's pool makes the interpreter wait for what its threads
+    still do; an update of a map takes seconds, and who ends the service has
+    only so much patience.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._queue: SimpleQueue[_Work | None] = SimpleQueue()
+        self._is_shut = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def submit(self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
+        """Have something done when its turn comes.
+
+        Raises:
+            RuntimeError: it is shut down.
+        """
+        if self._is_shut:
+            raise RuntimeError("the worker is shut down")
+        future: Future[_T] = Future()
+        self._queue.put((future, lambda: fn(*args, **kwargs)))
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Take nothing more; what waits is cancelled, or done first."""
+        self._is_shut = True
+        while cancel_futures:
+            try:
+                work = self._queue.get_nowait()
+            except Empty:
+                break
+            if work is not None:
+                work[0].cancel()
+        self._queue.put(None)
+        if wait:
+            self._thread.join()
+
+    def _run(self) -> None:
+        while (work := self._queue.get()) is not None:
+            future, do = work
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                result = do()
+            except BaseException as error:  # the future's owner is told, whatever it is
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+            del work, future, do
