@@ -88,20 +88,21 @@ class Drone:
         seed: int,
     ) -> None:
         self.system_id = system_id
-        self.autopilot, self._autopilot_link = autopilot
-        self._clock = clock
+        self.autopilot, self.autopilot_link = autopilot
+        self.clock = clock
         self._log_path = log_path
-        self._log = FlightLog(str(log_path), clock)
+        self.log = FlightLog(str(log_path), clock)
         self.maps = MapStore("")
         self.requests: list[FrameRequest] = []
         self.estimator = Estimator(
-            FilterOptions(), LocalizationOptions(), lambda why: self._log.event("jump", why)
+            FilterOptions(), LocalizationOptions(), lambda why: self.log.event("jump", why)
         )
         swarm = SwarmOptions(members, demo.LEADER, demo.known_distances(1, 2))
         rng = np.random.default_rng(seed)
+        self.group = Group(swarm, system_id)
         self.exchange = Exchange(
-            system_id, Group(swarm, system_id), Transfers(transfer, rng), self.maps,
-            self._autopilot_link, demo.sensor(system_id), clock, self._log, executor,
+            system_id, self.group, Transfers(transfer, rng), self.maps,
+            self.autopilot_link, demo.sensor(system_id), clock, self.log, executor,
             self.estimator,
             ExchangeOptions(swarm, demo.MAP_OPTIONS, update, demo.FEATURES, "akaze", inter), rng,
         )  # fmt: skip
@@ -112,11 +113,11 @@ class Drone:
 
     async def run(self) -> None:
         async with asyncio.TaskGroup() as parts:
-            for part in (self._autopilot_link, self._link, self.exchange):
+            for part in (self.autopilot_link, self._link, self.exchange):
                 parts.create_task(part.run())
 
     def close(self) -> None:
-        self._log.close()
+        self.log.close()
 
     def track(self, n_landmarks: int) -> None:
         """Have the drone look at a frame with so many landmarks in it, without one at 0."""
@@ -133,10 +134,10 @@ class Drone:
 
     async def see(self, frame: Frame) -> None:
         """Have the drone take a frame, when its autopilot has measured at that instant."""
-        self._clock.advance_to(frame.captured_at_ns)
+        self.clock.advance_to(frame.captured_at_ns)
         taken = demo.shot(self.system_id).ned_from_body
         self.autopilot.measure(frame.captured_at_ns, taken.quaternion())
-        assert await self._autopilot_link.attitude_at(frame.captured_at_ns, 5.0) is not None
+        assert await self.autopilot_link.attitude_at(frame.captured_at_ns, 5.0) is not None
         self.exchange.on_frame(frame)
 
     @property

@@ -306,7 +306,10 @@ def fuse(
     absorbing = np.zeros((len(state.covariance), 6))
     absorbing[_P, :3] = absorbing[_B, 3:] = rotation
     prior = state.covariance + absorbing @ state.own_map_covariance @ absorbing.T
-    prior /= omega
+    # Of velocity and offset only what follows from the pose is widened with it: what is
+    # unknown of them besides is the drone's own motion, of which no peer ever heard.
+    with_pose = prior @ observation.T
+    prior += (1.0 / omega - 1.0) * with_pose @ np.linalg.solve(own, with_pose.T)
     noise = covariance / (1.0 - omega)
     expected = observation @ prior @ observation.T + noise
     gain = np.linalg.solve(expected, observation @ prior).T

@@ -1,0 +1,74 @@
+"""A drone of a swarm that flies: its camera and the line from frame to pose beside its exchange."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+from sitl.frame_server import FrameServer
+from tests.daemon import demo
+from tests.daemon.swarm import Drone
+from tests.daemon.waiting import beside
+from vcl_companion.cameras.stream import StreamCamera
+from vcl_companion.daemon.companion import Companion, CompanionOptions
+from vcl_companion.daemon.frame_outcomes import FrameOutcomes
+from vcl_companion.daemon.health import Health
+from vcl_companion.localization.intra import LocalizationOptions
+
+# More landmarks than any picture has: it cannot localize itself, whatever it sees.
+STARVED = LocalizationOptions(min_inliers=10_000)
+
+
+@dataclass(frozen=True, eq=False)
+class Flier:
+    """A flying drone."""
+
+    drone: Drone
+    server: FrameServer
+
+    def give(self, k: int) -> None:
+        """Hand out its k-th picture, and its attitude before it."""
+        shot = demo.shot(self.drone.system_id, k)
+        self.drone.autopilot.measure(shot.at_ns, shot.ned_from_body.quaternion())
+        self.server.give(self.server.n_given, shot.at_ns, demo.png(shot.image))
+
+    def sources(self) -> list[tuple[int, str, str | None]]:
+        """Sequence, outcome and source of every frame, as they were answered."""
+        lines = self.drone.lines("frame")
+        return [(line["sequence"], line["outcome"], line["source"]) for line in lines]
+
+
+@contextlib.asynccontextmanager
+async def flying(
+    drone: Drone, localization: LocalizationOptions | None = None
+) -> AsyncIterator[Flier]:
+    """Fly a drone that was started; ``STARVED`` for one that sees too little."""
+    options = CompanionOptions(demo.FEATURES, localization or LocalizationOptions())
+    sensor = demo.sensor(drone.system_id)
+    size_px = (sensor.camera.width_px, sensor.camera.height_px)
+    async with contextlib.AsyncExitStack() as stack:
+        server = FrameServer(f"mav{drone.system_id - 1}")
+        port = await server.start()
+        stack.push_async_callback(server.close)
+        camera = StreamCamera("127.0.0.1", port, size_px, drone.clock)
+        stack.push_async_callback(camera.close)
+        health = Health(drone.autopilot_link, drone.log)
+        companion = Companion(
+            camera,
+            FrameOutcomes(camera, drone.clock, health, drone.log),
+            sensor,
+            drone.autopilot_link,
+            drone.maps,
+            drone.estimator,
+            drone.exchange.inter,
+            drone.exchange.on_frame,
+            health,
+            drone.log,
+            stack.enter_context(ThreadPoolExecutor(1)),
+            options,
+        )
+        await stack.enter_async_context(beside(companion.read_camera(), companion.run()))
+        await server.connected()
+        yield Flier(drone, server)
