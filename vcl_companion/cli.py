@@ -32,8 +32,12 @@ class _Commands(click.Group):
         try:
             return super().invoke(ctx)
         except VclError as error:
-            click.echo(f"vcl: {' '.join(str(error).split())}", err=True)
+            _tell(error)
             ctx.exit(2)
+
+
+def _tell(error: VclError) -> None:
+    click.echo(f"vcl: {' '.join(str(error).split())}", err=True)
 
 
 class _JournalFormatter(logging.Formatter):
@@ -69,8 +73,7 @@ def main() -> None:
     type=click.Path(path_type=Path),
     help="The daemon's configuration (systemd/vcl-companion.toml documents every setting).",
 )
-@click.pass_context
-def run(ctx: click.Context, config_path: Path) -> None:
+def run(config_path: Path) -> None:
     """Run the daemon of one drone until SIGTERM or Ctrl-C.
 
     Exit status: 0 after a clean end, 2 when the configuration or a device
@@ -84,7 +87,17 @@ def run(ctx: click.Context, config_path: Path) -> None:
     set_up_logging(config.log)
     from vcl_companion.daemon.assemble import run_daemon
 
-    ctx.exit(run_daemon(config))
+    try:
+        status = run_daemon(config)
+    except VclError as error:
+        _tell(error)
+        status = 2
+    # A worker may still be deep in OpenCV. The interpreter, ending, would cut its thread
+    # off there, which C++ answers with an abort; everything is closed and flushed by now.
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
 
 
 if __name__ == "__main__":

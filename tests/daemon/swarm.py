@@ -121,7 +121,7 @@ class Drone:
 
     def track(self, n_landmarks: int) -> None:
         """Have the drone look at a frame with so many landmarks in it, without one at 0."""
-        at_ns = self._clock.now_ns()
+        at_ns = self.clock.now_ns()
         predicted = self.estimator.predicted(at_ns, None)
         if n_landmarks == 0:
             self.estimator.take_nothing(predicted, at_ns, None)
@@ -174,13 +174,13 @@ class Flyer(Drone):
         sensor = demo.sensor(self.system_id)
         size_px = (sensor.camera.width_px, sensor.camera.height_px)
         port = await self.camera.start()
-        source = StreamCamera("127.0.0.1", port, size_px, self._clock)
+        source = StreamCamera("127.0.0.1", port, size_px, self.clock)
         with ThreadPoolExecutor(1) as executor:
-            health = Health(self._autopilot_link, self._log)
+            health = Health(self.autopilot_link, self.log)
             companion = Companion(
-                source, FrameOutcomes(source, self._clock, health, self._log), sensor,
-                self._autopilot_link, self.maps, self.estimator, self.exchange.inter,
-                self.exchange.on_frame, health, self._log, executor,
+                source, FrameOutcomes(source, self.clock, health, self.log), sensor,
+                self.autopilot_link, self.maps, self.estimator, self.exchange.inter,
+                self.exchange.on_frame, health, self.log, executor,
                 CompanionOptions(demo.FEATURES, LocalizationOptions()),
             )  # fmt: skip
             try:
