@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -47,7 +47,7 @@ class EstimateRow(msgspec.Struct, frozen=True):
     source: Literal["intra", "inter"]
     position: tuple[float, float, float]
     quaternion: tuple[float, float, float, float]
-    covariance: list[float]
+    covariance: Annotated[list[float], msgspec.Meta(min_length=21, max_length=21)]
     fused: bool
     host: int | None = None
     reason: str | None = None
@@ -97,6 +97,10 @@ class FlightLog:
         """Return how many frames had an outcome."""
         return sum(frame.outcome == outcome for frame in self.frames)
 
+    def share_from(self, source: str) -> float:
+        """Return the share of all frames whose pose had a source."""
+        return sum(frame.source == source for frame in self.frames) / max(len(self.frames), 1)
+
     def refusals(self) -> dict[str, int]:
         """Return how often each reason was given for a refused frame, the commonest first."""
         reasons = (f.reason or "no reason given" for f in self.frames if f.outcome == "refused")
@@ -135,15 +139,18 @@ def estimates_of(rows: Iterable[EstimateRow]) -> Estimates:
     """Return rows as estimates, their order kept.
 
     Raises:
-        ValueError: a row holds no rotation, or not 21 covariances.
+        FlightError: one is no pose.
     """
     kept = list(rows)
-    covariances = [covariance_from_upper(np.array(row.covariance, dtype=float)) for row in kept]
-    return Estimates(
-        np.array([row.captured_at_ns for row in kept], dtype=np.int64),
-        tuple(Pose.from_quaternion(np.array(r.quaternion), np.array(r.position)) for r in kept),
-        np.array(covariances).reshape(-1, 6, 6),
-    )
+    try:
+        covariances = [covariance_from_upper(np.array(row.covariance, dtype=float)) for row in kept]
+        return Estimates(
+            np.array([row.captured_at_ns for row in kept], dtype=np.int64),
+            tuple(Pose.from_quaternion(np.array(r.quaternion), np.array(r.position)) for r in kept),
+            np.array(covariances).reshape(-1, 6, 6),
+        )
+    except ValueError as error:
+        raise FlightError(f"an estimate in the flight log is no pose: {error}") from error
 
 
 class _VisionPosition(msgspec.Struct, frozen=True):

@@ -8,7 +8,11 @@ Terms beyond ``sitl.evaluation``'s:
 * ``latency_ms``: from a frame's arrival in the daemon to its outcome, of frames
   that were looked at. A drone's first frame waits for the first map by design
   and is told apart as ``first_frame_ms``.
-* ``landmarks``: median number of landmarks a sent pose rests on.
+* ``landmarks``: median number of landmarks that a frame's own pose rests on.
+* ``sources``: ``share`` of the frames whose pose was the frame's own (``intra``),
+  a peer's alone (``inter``), or both (``fused``); ``nees_median`` and ``ate_m`` of
+  the frames' own fixes, of the peers' proposals, and of what was sent; how many
+  ``proposals`` came and how many of them were ``proposals_fused``.
 * ``peer_bytes_per_s``: sent to the other drones, per second of recording time.
 * ``map``: the leader's last revision; ``revisions`` counts all of them.
 """
@@ -100,7 +104,8 @@ def _drone(drone: DroneResult, duration_s: float) -> dict[str, Any]:
         for frame in log.frames
         if frame.sequence > 0 and frame.latency_ms is not None and frame.outcome != "dropped"
     ]
-    inliers = [frame.inliers for frame in log.frames if frame.outcome == "localized"]
+    localized = [frame for frame in log.frames if frame.outcome == "localized"]
+    inliers = [frame.inliers for frame in localized if frame.source != "inter"]
     sent = summary.peer_bytes_sent if summary else None
     return {
         "frames": drone.n_frames,
@@ -118,6 +123,7 @@ def _drone(drone: DroneResult, duration_s: float) -> dict[str, Any]:
         "within_3_sigma_share": scores.within_3_sigma_share if scores else None,
         "within_3_sigma_or_10cm_share": scores.within_3_sigma_or_10cm_share if scores else None,
         "nees_median": scores.nees_median if scores else None,
+        "sources": _sources(drone),
         "latency_ms": {"p50": _percentile(looked_at, 50.0), "p99": _percentile(looked_at, 99.0)},
         "first_frame_ms": first[0] if first else None,
         "cpu_share": summary.cpu_s / summary.wall_s if summary and summary.wall_s > 0 else None,
@@ -125,6 +131,18 @@ def _drone(drone: DroneResult, duration_s: float) -> dict[str, Any]:
         "peer_bytes_per_s": sent / duration_s if sent is not None and duration_s > 0 else None,
         "peer_bytes_sent": sent,
         "landmarks": float(np.median(inliers)) if inliers else 0,
+    }
+
+
+def _sources(drone: DroneResult) -> dict[str, Any]:
+    judged = {"sent": drone.scores, **{s: drone.alone.get(s) for s in ("intra", "inter")}}
+    proposals = [row for row in drone.log.estimates if row.source == "inter"]
+    return {
+        "share": {s: drone.log.share_from(s) for s in ("intra", "inter", "fused")},
+        "nees_median": {k: scores.nees_median if scores else None for k, scores in judged.items()},
+        "ate_m": {k: scores.ate_m if scores else None for k, scores in judged.items()},
+        "proposals": len(proposals),
+        "proposals_fused": sum(row.fused for row in proposals),
     }
 
 

@@ -12,6 +12,7 @@ from sitl.plotting import colour
 from sitl.result import FlightResult
 
 _MAX_EVENTS = 200
+_JUDGED = ("intra", "inter", "sent")
 
 _COLUMNS = (
     ("frames", "frames", "{:d}", 1.0),
@@ -42,6 +43,7 @@ def page(result: FlightResult, report: Mapping[str, Any]) -> str:
         _alarms(report),
         section("Where they flew", _flight_note(result), report_plots.trajectories_svg(result)),
         section("How well", _SCORE_NOTE, _score_table(report)),
+        section("Whence the poses", _SOURCE_NOTE, _source_table(report)),
         section("Error along every axis", _ERROR_NOTE, errors) if errors else "",
         section("Tracked landmarks", "", report_plots.landmarks_svg(result)),
         section("Latency and load", _LATENCY_NOTE,
@@ -58,6 +60,11 @@ _SCORE_NOTE = (
     "“aligned” after the best rotation and shift of each drone's own track. In 3σ: poses whose "
     "error stays within three of their own sigmas along each axis. NEES: median, 5.3 when the "
     "covariance is honest, more when it promises too much."
+)
+_SOURCE_NOTE = (
+    "Share of the frames whose pose came from the frame's own landmarks (intra), from a peer that "
+    "saw the same (inter), or from both. NEES and ATE of each by itself, before it was fused, "
+    "beside what was sent."
 )
 _ERROR_NOTE = (
     "Along the recording's axes; the band is three sigmas as sent, a red ring a pose outside it. "
@@ -124,6 +131,22 @@ def _score_table(report: Mapping[str, Any]) -> str:
     return _drone_table(report, _COLUMNS, ())
 
 
+def _source_table(report: Mapping[str, Any]) -> str:
+    heads = [
+        *("intra %", "inter %", "fused %", "proposals", "taken"),
+        *(f"{what} {s}" for what in ("NEES", "ATE cm") for s in _JUDGED),
+    ]
+    rows = []
+    for n, (name, drone) in enumerate(report["drones"].items()):
+        said = drone["sources"]
+        cells = [_number(said["share"][s], "{:.1f}", 100.0) for s in ("intra", "inter", "fused")]
+        cells += [_number(said[key], "{:d}", 1.0) for key in ("proposals", "proposals_fused")]
+        cells += [_number(said["nees_median"][s], "{:.1f}", 1.0) for s in _JUDGED]
+        cells += [_number(said["ate_m"][s], "{:.1f}", 100.0) for s in _JUDGED]
+        rows.append(_row(n, name, cells))
+    return _table(heads, rows)
+
+
 def _load_table(report: Mapping[str, Any]) -> str:
     return _drone_table(report, _LOAD_COLUMNS, ("p50", "p99"))
 
@@ -136,12 +159,18 @@ def _drone_table(
     heads = [f"{p} ms" for p in percentiles] + [label for _, label, _, _ in columns]
     rows = []
     for n, (name, drone) in enumerate(report["drones"].items()):
-        swatch = f'<span class=swatch style="background:{colour(n)}"></span>'
         cells = [_number(drone["latency_ms"][p], "{:.1f}", 1.0) for p in percentiles]
         cells += [_number(drone[key], form, scale) for key, _, form, scale in columns]
-        rows.append(
-            f"<tr><td>{swatch}{escape(name)}</td>{''.join(f'<td>{c}</td>' for c in cells)}</tr>"
-        )
+        rows.append(_row(n, name, cells))
+    return _table(heads, rows)
+
+
+def _row(n: int, drone: str, cells: Sequence[str]) -> str:
+    swatch = f'<span class=swatch style="background:{colour(n)}"></span>'
+    return f"<tr><td>{swatch}{escape(drone)}</td>{''.join(f'<td>{c}</td>' for c in cells)}</tr>"
+
+
+def _table(heads: Sequence[str], rows: Sequence[str]) -> str:
     head = "".join(f"<th>{escape(label)}</th>" for label in ["drone", *heads])
     return f"<div class=scroll><table><tr>{head}</tr>{''.join(rows)}</table></div>"
 

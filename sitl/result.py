@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +17,13 @@ from sitl.evaluation import (
     ref_from_world,
     scores,
 )
-from sitl.flight_log import FlightLog, MapRow, read_flight_log, read_received
+from sitl.flight_log import (
+    FlightLog,
+    MapRow,
+    estimates_of,
+    read_flight_log,
+    read_received,
+)
 from sitl.plan import FlightPlan, PlannedDrone
 from sitl.processes import FlightError
 from vcl_companion.errors import WireError
@@ -54,6 +60,8 @@ class DroneResult:
         log: its daemon's log.
         errors: estimates against truth; None without truth or alignment.
         scores: those errors in numbers.
+        alone: the same of what was fused: ``intra``, the frames' own fixes, and
+            ``inter``, the peers' proposals, each as it came; only those there were.
     """
 
     name: str
@@ -64,6 +72,7 @@ class DroneResult:
     log: FlightLog
     errors: PoseErrors | None
     scores: Scores | None
+    alone: Mapping[str, Scores]
 
     @property
     def n_frames(self) -> int:
@@ -166,7 +175,27 @@ def _drone_result(
         log=log,
         errors=errors if errors is not None and len(errors.at_ns) else None,
         scores=scores(errors, axes) if errors is not None else None,
+        alone={} if alignment is None else _alone(planned, truth, log, alignment, axes),
     )
+
+
+def _alone(
+    planned: PlannedDrone,
+    truth: tuple[Pose | None, ...],
+    log: FlightLog,
+    alignment: Pose,
+    axes: Array,
+) -> dict[str, Scores]:
+    """Return how good fixes and proposals were by themselves, before anything was fused."""
+    true = dict(zip(planned.frames_at_ns.tolist(), truth, strict=True))
+    out = {}
+    for source in ("intra", "inter"):
+        rows = [row for row in log.estimates if row.source == source]
+        at_frames = tuple(true.get(row.captured_at_ns) for row in rows)
+        found = scores(pose_errors(estimates_of(rows), at_frames, alignment), axes)
+        if found is not None:
+            out[source] = found
+    return out
 
 
 def _truth_at_frames(planned: PlannedDrone) -> tuple[Pose | None, ...]:

@@ -13,14 +13,9 @@ from tests.mapping.views import descriptors_of
 from tests.scenes import facade_scene, perturbed
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import exp_so3, matrix_from_euler
-from vcl_companion.localization.inter import (
-    InterOptions,
-    NoProposal,
-    Observer,
-    Proposal,
-    localize_inter,
-)
+from vcl_companion.localization.inter import NoProposal, Proposal, localize_inter
 from vcl_companion.localization.map_index import MapIndex
+from vcl_companion.localization.pair_evidence import InterOptions, Observer
 from vcl_companion.vision.features import Features
 
 HOST = Pose(matrix_from_euler(0.02, -0.03, 0.05), np.array([1.0, 0.8, -0.3]))

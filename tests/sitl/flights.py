@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,12 @@ from sitl.out_folder import prepare_folder
 from sitl.plan import FlightPlan, FlyOptions, plan_flight
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, euler_from_matrix, matrix_from_euler
+from vcl_companion.geometry.rotation import (
+    Array,
+    euler_from_matrix,
+    matrix_from_euler,
+    quaternion_from_matrix,
+)
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.recording import (
     BODY_FROM_CAM_FORWARD,
@@ -52,6 +57,9 @@ class Flight:
         refused: (drone, frame) without a pose.
         dropped: (drone, frame) never looked at.
         unlogged: (drone, frame) that the daemon's log forgets.
+        proposed: (drone, frame) that a peer said a pose of, and how far it was off, m;
+            without a fix of its own such a frame has only that.
+        starved: (drone, frame) without a fix of its own.
         error: (drone, frame) to the (6,) error of its pose, as MAVLink puts it.
     """
 
@@ -62,6 +70,8 @@ class Flight:
     refused: frozenset[tuple[str, int]] = frozenset()
     dropped: frozenset[tuple[str, int]] = frozenset()
     unlogged: frozenset[tuple[str, int]] = frozenset()
+    proposed: Mapping[tuple[str, int], float] = field(default_factory=dict)
+    starved: frozenset[tuple[str, int]] = frozenset()
     error: ErrorOf = field(default=lambda _drone, _frame: np.zeros(6))
 
 
@@ -135,8 +145,18 @@ def _log(name: str, n: int, flight: Flight, revision: str, n_bytes: int) -> list
             outcome, reason = "refused", "9 of 30 <landmarks>"
         if (name, k) in flight.dropped:
             outcome = "dropped"
+        source = None
+        if outcome == "localized":
+            source = "intra" if (name, k) not in flight.proposed else "fused"
+            source = "inter" if (name, k) in flight.starved else source
+        if source in ("intra", "fused"):
+            lines.append(_estimate(n, k, flight.error(name, k)))
+        if (name, k) in flight.proposed:
+            off = np.array([flight.proposed[name, k], 0, 0, 0, 0, 0])
+            lines.append(_estimate(n, k, off, host=3))
         lines.append(
-            {"kind": "frame", "sequence": k, "captured_at_ns": at_ns(n, k), "outcome": outcome,
+            {"kind": "frame", "source": source, "sequence": k, "captured_at_ns": at_ns(n, k),
+             "outcome": outcome,
              "reason": reason, "latency_ms": _latency_ms(k, outcome), "matched": 150 - k,
              "inliers": 100 - k}
         )  # fmt: skip
@@ -145,6 +165,21 @@ def _log(name: str, n: int, flight: Flight, revision: str, n_bytes: int) -> list
          "resident_mb": 120.0, "peer_bytes_sent": 4400, "peer_bytes_received": 0}
     )  # fmt: skip
     return lines
+
+
+def _estimate(n: int, k: int, error: Array, host: int | None = None) -> dict[str, Any]:
+    """Return what the log says of a fix, or of a host's proposal; one beyond 1 m is not fused."""
+    truth = NED_FROM_WORLD.inverse() @ ned_from_body(n, k)
+    roll, pitch, yaw = np.add(euler_from_matrix(truth.rotation), error[3:])
+    far = bool(np.linalg.norm(error[:3]) > 1.0)
+    return {
+        "kind": "estimate", "captured_at_ns": at_ns(n, k), "host": host,
+        "source": "intra" if host is None else "inter",
+        "position": (truth.translation + error[:3]).tolist(),
+        "quaternion": quaternion_from_matrix(matrix_from_euler(roll, pitch, yaw)).tolist(),
+        "covariance": upper_from_covariance(np.diag(SIGMAS**2)).tolist(),
+        "fused": not far, "reason": "far off" if far else None,
+    }  # fmt: skip
 
 
 def _latency_ms(k: int, outcome: str) -> float | None:

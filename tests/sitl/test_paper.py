@@ -21,7 +21,7 @@ from sitl import paper_fingerprint
 from sitl.__main__ import main
 from sitl.evaluation import upper_from_covariance
 from sitl.paper import PaperResult, paper_json
-from sitl.paper_estimates import estimates_of
+from sitl.paper_estimates import by_source
 from sitl.paper_experiments import (
     EXPERIMENTS,
     NOT_FUSED,
@@ -67,12 +67,15 @@ def left_behind(
     """Write a flight with estimate rows in mav1's log and read it as the command does."""
     folder.mkdir(parents=True)
     plan, out = leave_behind(folder, flight)
-    with (out / "run" / "mav1" / "flight.jsonl").open("a") as log:
-        log.writelines(json.dumps(row) + "\n" for row in rows or [])
+    for drone in plan.drones:
+        log = out / "run" / drone.name / "flight.jsonl"
+        kept = [line for line in log.read_text().splitlines() if '"estimate"' not in line]
+        added = [json.dumps(row) for row in rows or []] if drone.name == "mav1" else []
+        log.write_text("\n".join([*kept, *added]) + "\n")
     result = gather(plan, out)
     report = report_of(result)
     (out / "report.json").write_text(json.dumps(report))
-    read = {drone.name: estimates_of(result, drone) for drone in result.drones}
+    read = {drone.name: by_source(result, drone) for drone in result.drones}
     estimates = {name: told for name, told in read.items() if told is not None}
     return PaperFlight(EXPERIMENT[name], PIPELINE, fused, out, result, report, estimates)
 
@@ -171,7 +174,7 @@ def test_a_log_without_estimates_has_none_and_a_broken_one_says_where(tmp_path: 
     for n, broken in enumerate(
         ({**row, "covariance": [1.0] * 20}, {**row, "quaternion": [0.0, 0.0, 0.0, 0.0]})
     ):
-        with pytest.raises(FlightError, match="log of mav1: an estimate is no pose"):
+        with pytest.raises(FlightError, match=r"flight(\.jsonl, row| log is no pose)"):
             left_behind(tmp_path / f"b{n}", "rotate", True, Flight(), [broken])
 
 

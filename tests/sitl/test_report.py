@@ -94,6 +94,29 @@ def test_numbers_are_those_of_the_logs(tmp_path: Path) -> None:
     assert report["map"] == {"revisions": 1, "landmarks": 200, "bytes": size, "keyframes": 1}
 
 
+def test_the_report_tells_whence_the_poses_came_and_how_good_each_source_was(
+    tmp_path: Path,
+) -> None:
+    flight = Flight(
+        n_frames=10,
+        proposed={("mav1", 2): 0.1, ("mav1", 4): 0.1, ("mav1", 6): 2.0},
+        starved=frozenset({("mav1", 4)}),
+        refused=frozenset({("mav1", 9)}),
+    )
+    result, report, out = reported(tmp_path, flight)
+    said = report["drones"]["mav1"]["sources"]
+    assert said["share"] == {"intra": 0.6, "inter": 0.1, "fused": 0.2}
+    assert (said["proposals"], said["proposals_fused"]) == (3, 2)
+    assert said["nees_median"]["intra"] == pytest.approx(0.0, abs=1e-6)
+    assert said["nees_median"]["inter"] == pytest.approx((0.1 / SIGMAS[0]) ** 2, rel=1e-3)
+    assert said["ate_m"]["inter"] == pytest.approx(np.sqrt((0.01 + 0.01 + 4.0) / 3), rel=1e-3)
+    assert said["ate_m"]["sent"] == report["drones"]["mav1"]["ate_m"]
+    assert report["drones"]["mav1"]["landmarks"] == 96.0  # the starved frame has none
+    nobody = report["drones"]["mav0"]["sources"]
+    assert (nobody["nees_median"]["inter"], nobody["proposals"]) == (None, 0)
+    assert "Whence the poses" in page_of(result, out)
+
+
 def test_errors_come_out_as_they_were_put_in(tmp_path: Path) -> None:
     """White errors of the stated sigmas, but for the leader's first, which is the origin."""
     rng = np.random.default_rng(11)

@@ -22,8 +22,9 @@ from vcl_companion.daemon.mailbox import PeerMailbox
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.errors import WireError
 from vcl_companion.geometry.rotation import matrix_from_quaternion
-from vcl_companion.localization.inter import NoProposal, Observer, Proposal, localize_inter
+from vcl_companion.localization.inter import NoProposal, Proposal, localize_inter
 from vcl_companion.localization.map_index import MapIndex, index_map
+from vcl_companion.localization.pair_evidence import Observer
 from vcl_companion.localization.pose_filter import FilterState
 from vcl_companion.mapping.drone_view import decode_image
 from vcl_companion.recording.sensor import Sensor

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vcl_companion.localization.inter import InterOptions
+from vcl_companion.localization.pair_evidence import InterOptions
 from vcl_companion.swarm.group import Group
 from vcl_companion.vision.features import Detector
 
