@@ -136,14 +136,21 @@ def read_flight_log(path: Path) -> FlightLog:
 
 
 def estimates_of(rows: Iterable[EstimateRow]) -> Estimates:
-    """Return rows as estimates, their order kept."""
+    """Return rows as estimates, their order kept.
+
+    Raises:
+        FlightError: one is no pose.
+    """
     kept = list(rows)
-    covariances = [covariance_from_upper(np.array(row.covariance, dtype=float)) for row in kept]
-    return Estimates(
-        np.array([row.captured_at_ns for row in kept], dtype=np.int64),
-        tuple(Pose.from_quaternion(np.array(r.quaternion), np.array(r.position)) for r in kept),
-        np.array(covariances).reshape(-1, 6, 6),
-    )
+    try:
+        covariances = [covariance_from_upper(np.array(row.covariance, dtype=float)) for row in kept]
+        return Estimates(
+            np.array([row.captured_at_ns for row in kept], dtype=np.int64),
+            tuple(Pose.from_quaternion(np.array(r.quaternion), np.array(r.position)) for r in kept),
+            np.array(covariances).reshape(-1, 6, 6),
+        )
+    except ValueError as error:
+        raise FlightError(f"an estimate in the flight log is no pose: {error}") from error
 
 
 class _VisionPosition(msgspec.Struct, frozen=True):

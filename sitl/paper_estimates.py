@@ -14,11 +14,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.evaluation import Estimates, PoseErrors, covariance_from_upper, pose_errors
-from sitl.flight_log import EstimateRow
-from sitl.processes import FlightError
+from sitl.evaluation import PoseErrors, pose_errors
+from sitl.flight_log import EstimateRow, estimates_of
 from sitl.result import DroneResult, FlightResult
-from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 
 Source = Literal["intra", "inter"]
@@ -63,7 +61,7 @@ class SourceEstimates:
         return np.array(instants, dtype=np.int64), [best[at_ns][1] for at_ns in instants]
 
 
-def estimates_of(flight: FlightResult, drone: DroneResult) -> SourceEstimates | None:
+def by_source(flight: FlightResult, drone: DroneResult) -> SourceEstimates | None:
     """Return a drone's estimates by source; None when its log has none, or there is no truth.
 
     Args:
@@ -79,17 +77,7 @@ def estimates_of(flight: FlightResult, drone: DroneResult) -> SourceEstimates | 
     names = {planned.system_id: planned.name for planned in flight.plan.drones}
     truth = dict(zip(drone.frames_at_ns.tolist(), drone.truth, strict=True))
     rows = [row for row in rows if truth.get(row.captured_at_ns) is not None]
-    try:
-        poses = [Pose.from_quaternion(np.array(r.quaternion), np.array(r.position)) for r in rows]
-        covariances = covariance_from_upper(
-            np.array([r.covariance for r in rows], dtype=float).reshape(len(rows), -1)
-            if rows
-            else np.empty((0, 21))
-        )
-    except ValueError as error:
-        raise FlightError(f"log of {drone.name}: an estimate is no pose ({error})") from error
-    at_ns = np.array([row.captured_at_ns for row in rows], dtype=np.int64)
-    estimates = Estimates(at_ns, tuple(poses), covariances)
+    estimates = estimates_of(rows)
     true = tuple(truth[row.captured_at_ns] for row in rows)
     return SourceEstimates(
         errors=pose_errors(estimates, true, flight.ref_from_world),

@@ -15,7 +15,7 @@ from typing import Any
 
 from sitl import paper_fingerprint
 from sitl.fly import Progress, fly
-from sitl.paper_estimates import SourceEstimates, estimates_of
+from sitl.paper_estimates import SourceEstimates, by_source
 from sitl.paper_experiments import Experiment, Pipeline
 from sitl.paper_recordings import Rendered
 from sitl.plan import FlyOptions, plan_flight
@@ -99,7 +99,7 @@ def flown(
         paper_fingerprint.write(folder / _FINGERPRINT, now)
     progress("comparing with the truth", 0, 0)
     result = gather(plan_flight(read_recording(recording.path), options), folder)
-    read = {drone.name: estimates_of(result, drone) for drone in result.drones}
+    read = {drone.name: by_source(result, drone) for drone in result.drones}
     why = ""
     if not reused and before is not None:
         why = f"{' and '.join(paper_fingerprint.differences(before, now))} changed"

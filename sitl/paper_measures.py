@@ -24,6 +24,7 @@ def flight_measures(flight: PaperFlight) -> dict[str, Any]:
     report = flight.report
     return {
         "folder": flight.folder.name,
+        "leader": flight.result.plan.leader,
         "speed": report["options"]["speed"],
         "settings": report["options"]["settings"],
         "duration_s": report["duration_s"],

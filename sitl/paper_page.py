@@ -206,17 +206,20 @@ def _nees(pipelines: Sequence[Pipeline], paper: Mapping[str, Any]) -> str:
                 nees = measured["nees_median"]
                 other = told["unfused"]["drones"][drone]["nees_median"] if told["unfused"] else {}
                 counts = measured["estimates"]
+                leads = drone == told["fused"]["leader"]
+                judged = _plain if leads else _judged
                 came = f"{counts['inter']} ({counts['inter_refused']})" if counts else "—"
                 cells = [
-                    _judged(nees["intra"]),
-                    f"{_judged(nees['inter'])} ({_plain(nees['inter_refused'])})",
-                    _judged(nees["sent"]),
+                    judged(nees["intra"]),
+                    f"{judged(nees['inter'])} ({_plain(nees['inter_refused'])})",
+                    judged(nees["sent"]),
                     _plain(other.get("sent")),
                     came,
                 ]
                 told_cells = "".join(f"<td>{cell}</td>" for cell in cells)
                 label = escape(name) if n == 0 else ""
-                rows.append(f"<tr><td>{label}</td><td>{escape(drone)}</td>{told_cells}</tr>")
+                who = escape(drone) + (", leader" if leads else "")
+                rows.append(f"<tr><td>{label}</td><td>{who}</td>{told_cells}</tr>")
     return section("NEES", _NEES_NOTE, _table(heads, rows))
 
 

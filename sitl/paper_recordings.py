@@ -1,8 +1,8 @@
 """The rendered scenarios, kept: each is rendered once, and anew when it or the renderer changed.
 
 ``FOLDER/NAME`` is the recording, ``FOLDER/NAME.rendered.json`` says from what it
-was made. Work in progress is ``FOLDER/NAME.unfinished``: what
-an interrupted run leaves there is begun again.
+was made. The recording gets its name at once when it is complete; what a run
+that was killed left unfinished is removed, and begun again.
 """
 
 from __future__ import annotations
@@ -64,22 +64,18 @@ def rendered(scenario: Scenario, label: str, folder: Path, progress: Progress) -
     why = ""
     if before is not None and path.exists():
         why = f"{' and '.join(paper_fingerprint.differences(before, now))} changed"
-    unfinished = folder / f"{label}.unfinished"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _remove(unfinished)
+        stale = folder / f".{label}.stale"
+        for left in (stale, *folder.glob(f".{label}.*.partial")):
+            if left.exists():
+                shutil.rmtree(left)
         if path.exists():
-            path.rename(unfinished)
-            _remove(unfinished)
-        render_scenario(scenario, unfinished, progress)
-        # The mark alone says nothing: a recording is there once its folder has its name.
+            path.rename(stale)
+            shutil.rmtree(stale)
+        # Before the recording, which alone says that it is there: never one without its mark.
         paper_fingerprint.write(mark, now)
-        unfinished.rename(path)
+        render_scenario(scenario, path, progress)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written ({error.strerror})") from error
     return Rendered(path, now, reused=False, why=why)
-
-
-def _remove(folder: Path) -> None:
-    if folder.exists():
-        shutil.rmtree(folder)

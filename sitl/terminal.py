@@ -90,7 +90,7 @@ def show_goals(console: Console, goals: Mapping[str, Sequence[Goal]], out: Path)
     for pipeline, rows in goals.items():
         table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
         for title in ("flight", "shows", "goal", pipeline, ""):
-            table.add_column(title)
+            table.add_column(title, no_wrap=title in ("flight", ""))
         for row in rows:
             mark = {"met": "[green]met", "not met": "[red]not met"}.get(row.verdict, row.verdict)
             texts = (row.experiment or "all", row.what, row.goal, row.measured)

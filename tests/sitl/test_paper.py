@@ -21,7 +21,7 @@ from sitl import paper_fingerprint
 from sitl.__main__ import main
 from sitl.evaluation import upper_from_covariance
 from sitl.paper import PaperResult, paper_json
-from sitl.paper_estimates import estimates_of
+from sitl.paper_estimates import by_source
 from sitl.paper_experiments import (
     EXPERIMENTS,
     NOT_FUSED,
@@ -67,12 +67,15 @@ def left_behind(
     """Write a flight with estimate rows in mav1's log and read it as the command does."""
     folder.mkdir(parents=True)
     plan, out = leave_behind(folder, flight)
-    with (out / "run" / "mav1" / "flight.jsonl").open("a") as log:
-        log.writelines(json.dumps(row) + "\n" for row in rows or [])
+    for drone in plan.drones:
+        log = out / "run" / drone.name / "flight.jsonl"
+        kept = [line for line in log.read_text().splitlines() if '"estimate"' not in line]
+        added = [json.dumps(row) for row in rows or []] if drone.name == "mav1" else []
+        log.write_text("\n".join([*kept, *added]) + "\n")
     result = gather(plan, out)
     report = report_of(result)
     (out / "report.json").write_text(json.dumps(report))
-    read = {drone.name: estimates_of(result, drone) for drone in result.drones}
+    read = {drone.name: by_source(result, drone) for drone in result.drones}
     estimates = {name: told for name, told in read.items() if told is not None}
     return PaperFlight(EXPERIMENT[name], PIPELINE, fused, out, result, report, estimates)
 
@@ -171,7 +174,7 @@ def test_a_log_without_estimates_has_none_and_a_broken_one_says_where(tmp_path: 
     for n, broken in enumerate(
         ({**row, "covariance": [1.0] * 20}, {**row, "quaternion": [0.0, 0.0, 0.0, 0.0]})
     ):
-        with pytest.raises(FlightError, match="log of mav1: an estimate is no pose"):
+        with pytest.raises(FlightError, match=r"flight(\.jsonl, row| log is no pose)"):
             left_behind(tmp_path / f"b{n}", "rotate", True, Flight(), [broken])
 
 
@@ -415,11 +418,13 @@ def test_an_interrupted_rendering_is_begun_again(tmp_path: Path) -> None:
             rendered(small(tmp_path), "small", folder, interrupted)
         assert not (folder / "small").exists()
     assert not rendered(small(tmp_path), "small", folder, lambda done, total: None).reused
-    assert not (folder / "small.unfinished").exists()
+    # A run that was killed could not clean up.
+    (folder / ".small.4711.partial" / "mav0").mkdir(parents=True)
     # What is removed for a new one counts as removed, however far that got.
     with pytest.raises(KeyboardInterrupt):
         rendered(small(tmp_path, SMALL.replace("0.5", "0.75")), "small", folder, interrupted)
     assert not rendered(small(tmp_path), "small", folder, lambda done, total: None).reused
+    assert sorted(path.name for path in folder.iterdir()) == ["small", "small.rendered.json"]
 
 
 def test_a_recording_of_unknown_making_is_left_alone(tmp_path: Path) -> None:
