@@ -53,12 +53,13 @@ def test_every_solution_is_an_essential_matrix_of_the_matches() -> None:
     assert np.quantile(worst, 0.98) < 1e-7
 
 
-def test_agrees_with_poselib() -> None:
+@pytest.mark.parametrize(("flat", "least"), [(False, 285), (True, 275)])
+def test_agrees_with_poselib(flat: bool, least: int) -> None:
     poselib = pytest.importorskip("poselib", exc_type=ImportError)
     rng = np.random.default_rng(3)
     same = 0
     for _ in range(300):
-        a, b, _ = views(rng)
+        a, b, _ = views(rng, flat)
         ours = five_point(a, b)
         rays = [np.column_stack([side, np.ones(5)]) for side in (a, b)]
         rays = [side / np.linalg.norm(side, axis=1, keepdims=True) for side in rays]
@@ -67,7 +68,7 @@ def test_agrees_with_poselib() -> None:
             min(apart(e, other) for other in ours) < 1e-4 for e in theirs
         )
     # The rest are near-double roots, of which either may miss a pair.
-    assert same >= 285
+    assert same >= least
 
 
 def test_an_image_that_only_turned_does_not_break_it() -> None:
