@@ -38,7 +38,7 @@ def test_a_changed_byte_is_noticed(blob: bytes, data: st.DataObject) -> None:
 
 def test_the_tag_depends_on_kind_and_content_only() -> None:
     tags = {describe(kind, blob).tag for kind in BlobKind for blob in (b"", b"a", b"b", b"aa")}
-    assert len(tags) == 8
+    assert len(tags) == 4 * len(BlobKind)
     assert describe(BlobKind.MAP, b"abc").tag == describe(BlobKind.MAP, b"abc").tag
 
 

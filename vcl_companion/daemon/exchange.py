@@ -232,8 +232,10 @@ class Exchange:
             match event:
                 case BlobReceived(peer=peer, kind=BlobKind.FRAME_ANSWER, blob=blob):
                     self._take_frame(peer, blob)
-                case BlobReceived(peer=peer, kind=BlobKind.MAP, blob=blob):
-                    self._sharing.offer(peer, blob)
+                case BlobReceived(
+                    peer=peer, kind=(BlobKind.MAP | BlobKind.MAP_UPDATE) as kind, blob=blob
+                ):
+                    self._sharing.offer(peer, kind, blob)
                 case BlobDelivered(peer=peer, transfer_id=transfer_id):
                     self._sharing.delivered(peer, transfer_id)
                 case TransferFailed(peer=peer, reason=reason):

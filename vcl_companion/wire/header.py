@@ -37,6 +37,7 @@ class BlobKind(IntEnum):
 
     FRAME_ANSWER = 65
     MAP = 66
+    MAP_UPDATE = 68
 
 
 class VersionMismatchError(WireError):
