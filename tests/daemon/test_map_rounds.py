@@ -330,7 +330,7 @@ def test_a_map_that_was_left_is_taken_back_only_from_a_coordinator_that_insists(
             assert dict(two.exchange.refused) == {"map that was left": 1}
             # It is handed ours: first without the images it has, and when that is in vain, whole.
             assert (await one.blobs.get()).blob == short
-            await passes(11.0)
+            await passes(21.0)
             assert (await one.blobs.get()).blob == NEXT
             await passes(UPDATES.delivery_wait_s)
             one.forget()

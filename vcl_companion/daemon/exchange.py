@@ -237,7 +237,7 @@ class Exchange:
                 ):
                     self._sharing.offer(peer, kind, blob)
                 case BlobDelivered(peer=peer, transfer_id=transfer_id):
-                    self._sharing.delivered(peer, transfer_id)
+                    self._sharing.delivered(peer, transfer_id, self._now_s())
                 case TransferFailed(peer=peer, reason=reason):
                     self._log.event("transfer", f"to drone {peer}: {reason}")
                     _log.warning("transfer to drone %d failed: %s", peer, reason)

@@ -27,8 +27,10 @@ from vcl_companion.wire.map_codec import encode_map
 
 _log = logging.getLogger(__name__)
 
-# A peer needs this long to take a map in and to say so; a failed transfer begins anew.
+# A transfer that has failed begins anew after this.
 _HAND_AGAIN_S = 10.0
+# A peer, however busy, has taken a map in and said so after this, or refused it.
+_TAKE_IN_S = 20.0
 # What was delivered in vain is not likely to be of use the next time: ever more rarely.
 _HAND_AGAIN_AT_MOST_S = 120.0
 # A map that was refused may come again after this: we may know better by then.
@@ -37,18 +39,12 @@ _LOOK_AGAIN_S = 5.0
 
 @dataclass(frozen=True)
 class _Handed:
-    """A map that was handed to a peer, and how often it arrived there."""
+    """A map that was handed to a peer, how often it arrived there, and when it is handed again."""
 
     revision: bytes
-    at_s: float
     transfer_id: int
     n_delivered: int
-
-    @property
-    def again_at_s(self) -> float:
-        """When it is handed again if the peer does not fly on it by then."""
-        wait_s = _HAND_AGAIN_S * 2.0 ** max(self.n_delivered - 1, 0)
-        return self.at_s + min(wait_s, _HAND_AGAIN_AT_MOST_S)
+    again_at_s: float
 
 
 class MapSharing:
@@ -109,11 +105,14 @@ class MapSharing:
         """Note that a peer may have lost the map it was handed: it was restarted, or away."""
         self._handed.pop(peer, None)
 
-    def delivered(self, peer: int, transfer_id: int) -> None:
-        """Note that a blob has reached a peer."""
+    def delivered(self, peer: int, transfer_id: int, now_s: float) -> None:
+        """Note that a blob has reached a peer, which may fly on it soon, or never."""
         handed = self._handed.get(peer)
         if handed is not None and handed.transfer_id == transfer_id:
-            self._handed[peer] = replace(handed, n_delivered=handed.n_delivered + 1)
+            wait_s = min(_TAKE_IN_S * 2.0**handed.n_delivered, _HAND_AGAIN_AT_MOST_S)
+            self._handed[peer] = replace(
+                handed, n_delivered=handed.n_delivered + 1, again_at_s=now_s + wait_s
+            )
 
     async def run(self) -> None:
         """Take in what peers offer, one map after the other, until cancelled."""
@@ -177,7 +176,9 @@ class MapSharing:
                 n_delivered = last.n_delivered
             kind, blob = self._form_for(peer, stored, n_delivered)
             sent_id = self._transfers.submit(peer, kind, blob, now_s)
-            self._handed[peer] = _Handed(stored.revision, now_s, sent_id, n_delivered)
+            self._handed[peer] = _Handed(
+                stored.revision, sent_id, n_delivered, now_s + _HAND_AGAIN_S
+            )
 
     def _form_for(self, peer: int, stored: StoredMap, n_delivered: int) -> tuple[BlobKind, bytes]:
         """Return what to send: without the images that a peer has, unless that was in vain."""
