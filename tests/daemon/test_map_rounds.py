@@ -18,6 +18,7 @@ from vcl_companion.swarm.transfer import BlobKind
 from vcl_companion.swarm.updates import UpdateOptions
 from vcl_companion.wire.frame_codec import encode_frame
 from vcl_companion.wire.map_codec import decode_map, parent_of, revision_of
+from vcl_companion.wire.map_update import decode_map_update, encode_map_update
 from vcl_companion.wire.messages import FrameRequest, MapState
 
 PAIR, TRIO, NEXT = demo.encoded_map(1, 2), demo.encoded_map(1, 2, 3), demo.encoded_update()
@@ -149,11 +150,13 @@ def test_when_the_coordinator_dies_in_a_round_the_next_one_makes_it(tmp_path: Pa
             three.hand(BlobKind.FRAME_ANSWER, answer, 2)
             await computed(lambda: two.revision != old)
             received = await three.blobs.get()
-            while revision_of(received.blob) != two.revision:
+            while received.kind != BlobKind.MAP_UPDATE:
                 received = await three.blobs.get()
-            assert received.kind == BlobKind.MAP
-            assert parent_of(received.blob) == old
-            drones = [keyframe.drone_id for keyframe in decode_map(received.blob).keyframes]
+            data = decode_map_update(received.blob, decode_map(PAIR))
+            assert revision_of(data) == two.revision
+            assert parent_of(data) == old
+            assert len(data) - len(received.blob) > 10_000  # two images
+            drones = [keyframe.drone_id for keyframe in decode_map(data).keyframes]
             assert drones[:2] == [1, 2]
             assert set(drones[2:]) == {2, 3}
 
@@ -318,13 +321,17 @@ def test_a_map_that_was_left_is_taken_back_only_from_a_coordinator_that_insists(
     async def scenario() -> None:
         async with swarm(1, 2, path=tmp_path) as members:
             two, one = await members.start(2, (1, 2), update=UPDATES), await members.stranger(1)
-            two.maps.replace(NEXT, demo.update_index())
+            short = encode_map_update(NEXT, decode_map(PAIR))
+            two.maps.replace(NEXT, demo.update_index(), short)
             await one.meets(2)
             one.say(MapState(revision_of(PAIR), 1, True), 2)
             one.hand(BlobKind.MAP, PAIR, 2)
             await until(lambda: bool(two.exchange.refused))
             assert dict(two.exchange.refused) == {"map that was left": 1}
-            assert (await one.blobs.get()).blob == NEXT  # it is handed ours
+            # It is handed ours: first without the images it has, and when that is in vain, whole.
+            assert (await one.blobs.get()).blob == short
+            await passes(21.0)
+            assert (await one.blobs.get()).blob == NEXT
             await passes(UPDATES.delivery_wait_s)
             one.forget()
             one.hand(BlobKind.MAP, PAIR, 2)

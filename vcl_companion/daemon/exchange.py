@@ -258,12 +258,14 @@ class Exchange:
             match event:
                 case BlobReceived(peer=peer, kind=BlobKind.FRAME_ANSWER, blob=blob):
                     self._take_frame(peer, blob)
-                case BlobReceived(peer=peer, kind=BlobKind.MAP, blob=blob):
-                    self._sharing.offer(peer, blob)
+                case BlobReceived(
+                    peer=peer, kind=(BlobKind.MAP | BlobKind.MAP_UPDATE) as kind, blob=blob
+                ):
+                    self._sharing.offer(peer, kind, blob)
                 case BlobReceived(peer=peer, kind=BlobKind.POSE_REQUEST, blob=blob):
                     self._inter_host.offer(peer, blob)
                 case BlobDelivered(peer=peer, transfer_id=transfer_id):
-                    self._sharing.delivered(peer, transfer_id)
+                    self._sharing.delivered(peer, transfer_id, self._now_s())
                 case TransferFailed(peer=peer, reason=reason):
                     self._log.event("transfer", f"to drone {peer}: {reason}")
                     _log.warning("transfer to drone %d failed: %s", peer, reason)

@@ -15,20 +15,22 @@ from dataclasses import dataclass, replace
 
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.mailbox import PeerMailbox
+from vcl_companion.daemon.map_offer import MapOffer, ReadyMap, ready_map
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.errors import WireError
-from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import NoMap
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.transfer import BlobKind, Transfers
 from vcl_companion.vision.features import Detector, FeatureOptions
-from vcl_companion.wire.map_codec import decode_map, encode_map, parent_of, revision_of
+from vcl_companion.wire.map_codec import encode_map
 
 _log = logging.getLogger(__name__)
 
-# A peer needs this long to take a map in and to say so; a failed transfer begins anew.
+# A transfer that has failed begins anew after this.
 _HAND_AGAIN_S = 10.0
+# A peer, however busy, has taken a map in and said so after this, or refused it.
+_TAKE_IN_S = 20.0
 # What was delivered in vain is not likely to be of use the next time: ever more rarely.
 _HAND_AGAIN_AT_MOST_S = 120.0
 # A map that was refused may come again after this: we may know better by then.
@@ -37,18 +39,12 @@ _LOOK_AGAIN_S = 5.0
 
 @dataclass(frozen=True)
 class _Handed:
-    """A map that was handed to a peer, and how often it arrived there."""
+    """A map that was handed to a peer, how often it arrived there, and when it is handed again."""
 
     revision: bytes
-    at_s: float
     transfer_id: int
     n_delivered: int
-
-    @property
-    def again_at_s(self) -> float:
-        """When it is handed again if the peer does not fly on it by then."""
-        wait_s = _HAND_AGAIN_S * 2.0 ** max(self.n_delivered - 1, 0)
-        return self.at_s + min(wait_s, _HAND_AGAIN_AT_MOST_S)
+    again_at_s: float
 
 
 class MapSharing:
@@ -91,43 +87,52 @@ class MapSharing:
         self._detector: Detector = detector
         self._features = features
         self._delivery_wait_s = delivery_wait_s
-        self._offered: PeerMailbox[bytes] = PeerMailbox()
+        self._offered: PeerMailbox[MapOffer] = PeerMailbox()
         self._handed: dict[int, _Handed] = {}
         self._behind_since_s: float | None = None  # the coordinator, as far as known
 
-    def offer(self, peer: int, data: bytes) -> None:
-        """Take a peer's encoded map; looked at when its turn comes."""
-        self._offered.put(peer, data)
+    def offer(self, peer: int, kind: BlobKind, blob: bytes) -> None:
+        """Take a peer's encoded map, whole or without its parent's images.
+
+        It is looked at when its turn comes.
+        """
+        try:
+            self._offered.put(peer, MapOffer.of(kind, blob))
+        except WireError as error:
+            self._refuse(peer, "map", str(error))
 
     def forgot(self, peer: int) -> None:
         """Note that a peer may have lost the map it was handed: it was restarted, or away."""
         self._handed.pop(peer, None)
 
-    def delivered(self, peer: int, transfer_id: int) -> None:
-        """Note that a blob has reached a peer."""
+    def delivered(self, peer: int, transfer_id: int, now_s: float) -> None:
+        """Note that a blob has reached a peer, which may fly on it soon, or never."""
         handed = self._handed.get(peer)
         if handed is not None and handed.transfer_id == transfer_id:
-            self._handed[peer] = replace(handed, n_delivered=handed.n_delivered + 1)
+            wait_s = min(_TAKE_IN_S * 2.0**handed.n_delivered, _HAND_AGAIN_AT_MOST_S)
+            self._handed[peer] = replace(
+                handed, n_delivered=handed.n_delivered + 1, again_at_s=now_s + wait_s
+            )
 
     async def run(self) -> None:
         """Take in what peers offer, one map after the other, until cancelled."""
         while True:
-            peer, data = await self._offered.take()
+            peer, offer = await self._offered.take()
             current = self._maps.current
-            if current is not None and current.revision == revision_of(data):
+            if current is not None and current.revision == offer.revision:
                 self._tell_state()  # it did not know that we have it
                 continue
-            why_not = self._why_not(peer, data)
+            why_not = self._why_not(peer, offer)
             if why_not is None:
-                index = await self._prepared(data)
-                if isinstance(index, NoMap):
-                    self._reject(peer, data, "map", index.reason)
+                ready = await self._prepared(offer)
+                if isinstance(ready, NoMap):
+                    self._reject(peer, offer, "map", ready.reason)
                     continue
-                why_not = self._why_not(peer, data)  # again: preparing took a while
+                why_not = self._why_not(peer, offer)  # again: preparing took a while
                 if why_not is None:
-                    await self._install(data, index)
+                    await self._install(ready)
                     continue
-            self._reject(peer, data, why_not)
+            self._reject(peer, offer, why_not)
 
     async def adopt(self, built: LandmarkMap, instead_of: StoredMap | None) -> NoMap | None:
         """Fly on a map of our own, exactly as peers will decode it.
@@ -144,11 +149,11 @@ class MapSharing:
             data = await loop.run_in_executor(self._executor, encode_map, built)
         except ValueError as error:
             return NoMap(str(error))
-        index = await self._prepared(data)
-        if isinstance(index, NoMap):
-            return index
+        ready = await self._prepared(MapOffer.of(BlobKind.MAP, data))
+        if isinstance(ready, NoMap):
+            return ready
         if self._maps.current is instead_of:
-            await self._install(data, index)
+            await self._install(ready)
         return None
 
     def hand_out(self, now_s: float) -> None:
@@ -169,8 +174,19 @@ class MapSharing:
                 if now_s < last.again_at_s:
                     continue
                 n_delivered = last.n_delivered
-            sent_id = self._transfers.submit(peer, BlobKind.MAP, stored.data, now_s)
-            self._handed[peer] = _Handed(stored.revision, now_s, sent_id, n_delivered)
+            kind, blob = self._form_for(peer, stored, n_delivered)
+            sent_id = self._transfers.submit(peer, kind, blob, now_s)
+            self._handed[peer] = _Handed(
+                stored.revision, sent_id, n_delivered, now_s + _HAND_AGAIN_S
+            )
+
+    def _form_for(self, peer: int, stored: StoredMap, n_delivered: int) -> tuple[BlobKind, bytes]:
+        """Return what to send: without the images that a peer has, unless that was in vain."""
+        state = self._group.state_of(peer)
+        has_parent = state is not None and state.revision == stored.parent
+        if stored.update and has_parent and n_delivered == 0:
+            return BlobKind.MAP_UPDATE, stored.update
+        return BlobKind.MAP, stored.data
 
     def _lacking(self, revision: bytes) -> list[int]:
         group = self._group
@@ -188,7 +204,7 @@ class MapSharing:
         is_other = not self._group.is_coordinator
         return is_other and state is not None and self._maps.has_left(state.revision)
 
-    def _why_not(self, peer: int, data: bytes) -> str | None:
+    def _why_not(self, peer: int, offer: MapOffer) -> str | None:
         """Return why we do not fly on a peer's map, or None if we do.
 
         Anybody's is taken while we have none, later only the coordinator's. The
@@ -198,29 +214,31 @@ class MapSharing:
         if current is None:
             return None
         if group.is_coordinator:
-            holders = group.holders(revision_of(data))
-            if 2 * len(holders) > len(group.alive) or _goes_on_from(current.revision, data):
+            holders = group.holders(offer.revision)
+            if 2 * len(holders) > len(group.alive) or offer.parent == current.revision:
                 return None
         if peer != group.coordinator:
             return "map, but not from the coordinator"
         since_s = self._behind_since_s
         now_s = asyncio.get_running_loop().time()
         has_its_way = since_s is not None and now_s >= since_s + self._delivery_wait_s
-        if self._maps.has_left(revision_of(data)) and not has_its_way:
+        if self._maps.has_left(offer.revision) and not has_its_way:
             return "map that was left"
         return None
 
-    def _reject(self, peer: int, data: bytes, kind: str, detail: str = "") -> None:
+    def _reject(self, peer: int, offer: MapOffer, kind: str, detail: str = "") -> None:
         """Count a map that is not taken; when it comes again it is looked at again."""
         self._refuse(peer, kind, detail)
         again_at_s = asyncio.get_running_loop().time() + _LOOK_AGAIN_S
-        self._transfers.forget(peer, BlobKind.MAP, data, again_at_s)
+        self._transfers.forget(peer, offer.kind, offer.blob, again_at_s)
 
-    async def _prepared(self, data: bytes) -> MapIndex | NoMap:
+    async def _prepared(self, offer: MapOffer) -> ReadyMap | NoMap:
         """Make a map ready for use, beside the event loop; or say why it cannot be used."""
         loop = asyncio.get_running_loop()
         try:
-            return await loop.run_in_executor(self._executor, self._index, data)
+            return await loop.run_in_executor(
+                self._executor, ready_map, offer, self._maps.current, self._detector, self._features
+            )
         except (WireError, ValueError) as error:
             return NoMap(str(error))
         except Exception as error:
@@ -228,23 +246,12 @@ class MapSharing:
             _log.exception("a map cannot be used")
             return NoMap(f"using it failed: {type(error).__name__}")
 
-    def _index(self, data: bytes) -> MapIndex:
-        """Decode and index; runs in the executor and touches nothing that changes."""
-        return index_map(decode_map(data), self._detector, self._features)
-
-    async def _install(self, data: bytes, index: MapIndex) -> None:
-        stored = self._maps.replace(data, index)
-        n_keyframes = len(index.landmark_map.keyframes)
-        self._log.map(stored.revision, stored.parent, stored.n_landmarks, len(data), n_keyframes)
+    async def _install(self, ready: ReadyMap) -> None:
+        stored = self._maps.replace(ready.data, ready.index, ready.update)
+        n_keyframes = len(ready.index.landmark_map.keyframes)
+        n_bytes = len(ready.data)
+        self._log.map(stored.revision, stored.parent, stored.n_landmarks, n_bytes, n_keyframes)
         self._log.event("map", f"{stored.n_landmarks} landmarks in {n_keyframes} keyframes")
         _log.info("map %s: %d landmarks", stored.revision.hex(), stored.n_landmarks)
         self._tell_state()
         await asyncio.get_running_loop().run_in_executor(self._executor, self._maps.keep, stored)
-
-
-def _goes_on_from(revision: bytes, data: bytes) -> bool:
-    """Whether an encoded map was made from a revision."""
-    try:
-        return parent_of(data) == revision
-    except WireError:
-        return False

@@ -28,11 +28,14 @@ class StoredMap:
         revision: its content hash.
         data: its encoded form, as handed on to peers.
         index: ready for localization.
+        update: the same for one who has its parent (``map_update``); empty when
+            we do not have that ourselves.
     """
 
     revision: bytes
     data: bytes
     index: MapIndex
+    update: bytes = b""
 
     @property
     def parent(self) -> bytes:
@@ -74,9 +77,9 @@ class MapStore:
                 why = getattr(error, "strerror", None) or error
                 raise ConfigError(f"[map] directory {directory!r}: {why}") from error
 
-    def replace(self, data: bytes, index: MapIndex) -> StoredMap:
+    def replace(self, data: bytes, index: MapIndex, update: bytes = b"") -> StoredMap:
         """Fly on this map from the next frame on."""
-        stored = StoredMap(revision_of(data), data, index)
+        stored = StoredMap(revision_of(data), data, index, update)
         if self.current is not None and self.current.revision != stored.revision:
             self._left.append(self.current.revision)
         self.current = stored

@@ -42,8 +42,12 @@ class UpdateOptions:
         joiner_spacing_s: time between them.
     """
 
-    tracked: int = 60
-    share: float = 0.5
+    # A round takes seconds, and in fast flight landmarks halve in five: after two halvings
+    # there must still be more than localization needs (15).
+    tracked: int = 100
+    # Beside its own keyframe a map is seen half as well again as from anywhere else: a third
+    # of the most that was seen is half of what is usual.
+    share: float = 0.35
     hold_s: float = 1.0
     interval_s: float = 5.0
     gather_timeout_s: float = 5.0

@@ -40,6 +40,7 @@ class BlobKind(IntEnum):
     FRAME_ANSWER = 65
     MAP = 66
     POSE_REQUEST = 67
+    MAP_UPDATE = 68
 
 
 class VersionMismatchError(WireError):

@@ -1,0 +1,116 @@
+"""A map without its parent's images: the same bytes again, and nothing else, whoever sent them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.wire.golden import assert_golden
+from tests.wire.samples import random_map, small_map
+from vcl_companion.errors import WireError
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.wire.header import PROTOCOL_VERSION, VersionMismatchError
+from vcl_companion.wire.map_codec import decode_map, encode_map, parent_of, revision_of
+from vcl_companion.wire.map_update import decode_map_update, encode_map_update, names_of_update
+
+PARENT = decode_map(encode_map(small_map()))
+
+
+def child() -> LandmarkMap:
+    """The small map with its second keyframe first, a new one, and other landmarks."""
+    first, second = PARENT.keyframes
+    new = replace(first, captured_at_ns=5, image_bytes=b"a new image")
+    return replace(
+        PARENT,
+        keyframes=(second, new, first),
+        points_world=PARENT.points_world + 1.0,
+        observed_px=np.stack(
+            [PARENT.observed_px[:, 1], PARENT.observed_px[:, 0], PARENT.observed_px[:, 0]], axis=1
+        ),
+        parent=revision_of(encode_map(PARENT)),
+    )
+
+
+CHILD = encode_map(child())
+
+
+def test_golden_bytes() -> None:
+    blob = encode_map_update(CHILD, PARENT)
+    assert_golden("map_update", blob)
+    assert decode_map_update(blob, PARENT) == CHILD
+    assert names_of_update(blob) == (revision_of(CHILD), parent_of(CHILD))
+    assert names_of_update(blob[:40]) == names_of_update(blob)
+
+
+@given(
+    st.integers(0, 2**32).map(np.random.default_rng), st.integers(0, 30), st.integers(1, 5),
+    st.integers(0, 3),
+)  # fmt: skip
+def test_what_comes_out_is_what_went_in(
+    rng: np.random.Generator, n_landmarks: int, n_old: int, n_new: int
+) -> None:
+    parent = random_map(rng, n_landmarks, n_old)
+    parent = replace(
+        parent, keyframes=tuple(replace(k, image_bytes=rng.bytes(500)) for k in parent.keyframes)
+    )
+    kept = [k for k in range(n_old) if rng.uniform() < 0.7]
+    more = random_map(rng, n_landmarks, max(n_new, 1))
+    keyframes = tuple(parent.keyframes[k] for k in kept) + tuple(
+        replace(k, image_bytes=b"new" + k.image_bytes) for k in more.keyframes
+    )
+    observed_px = np.full((n_landmarks, len(keyframes), 2), np.nan)
+    data = encode_map(
+        replace(more, keyframes=keyframes, observed_px=observed_px, parent=b"12345678")
+    )
+    blob = encode_map_update(data, parent)
+    assert decode_map_update(blob, parent) == data
+    assert len(data) - len(blob) == 498 * len(kept) - 8
+
+
+def test_another_parent_is_refused() -> None:
+    blob = encode_map_update(CHILD, PARENT)
+    first, second = PARENT.keyframes
+    other = replace(PARENT, keyframes=(first, replace(second, image_bytes=b"other")))
+    with pytest.raises(WireError, match="another map"):
+        decode_map_update(blob, other)
+    fewer = replace(PARENT, keyframes=(first,), observed_px=PARENT.observed_px[:, :1], distances=())
+    with pytest.raises(WireError, match="no keyframe 1"):
+        decode_map_update(blob, fewer)
+
+
+def test_an_image_that_would_be_taken_for_a_reference_is_not_encoded() -> None:
+    short = replace(child().keyframes[1], image_bytes=b"ab")
+    odd = replace(child(), keyframes=(child().keyframes[0], short, child().keyframes[2]))
+    with pytest.raises(ValueError, match="two bytes"):
+        encode_map_update(encode_map(odd), PARENT)
+
+
+@given(st.binary(max_size=200), st.sampled_from([b"", b"\x01", b"\x01\x44"]))
+def test_any_bytes_are_a_wire_error(body: bytes, head: bytes) -> None:
+    with pytest.raises(WireError):
+        decode_map_update(head + body, PARENT)
+
+
+@given(st.data())
+def test_mutated_updates_are_a_wire_error(data: st.DataObject) -> None:
+    blob = encode_map_update(CHILD, PARENT)
+    at = data.draw(st.integers(0, len(blob) - 1))
+    mutated = blob[:at] + data.draw(st.binary(max_size=4)) + blob[at + 1 :]
+    if mutated == blob:
+        return
+    with pytest.raises(WireError):
+        decode_map_update(mutated, PARENT)
+
+
+@pytest.mark.parametrize("decode", [names_of_update, lambda blob: decode_map_update(blob, PARENT)])
+def test_another_version_and_another_kind_are_recognised(decode: object) -> None:
+    assert callable(decode)
+    blob = encode_map_update(CHILD, PARENT)
+    with pytest.raises(VersionMismatchError):
+        decode(bytes([PROTOCOL_VERSION + 1]) + blob[1:])
+    with pytest.raises(WireError, match="not a map update"):
+        decode(CHILD)

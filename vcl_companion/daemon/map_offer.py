@@ -1,0 +1,78 @@
+"""A map that came or was made, and what has to be done with it before it can be flown on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from vcl_companion.daemon.map_store import StoredMap
+from vcl_companion.localization.map_index import MapIndex, index_map
+from vcl_companion.vision.features import Detector, FeatureOptions
+from vcl_companion.wire.header import BlobKind
+from vcl_companion.wire.map_codec import decode_map, parent_of, revision_of
+from vcl_companion.wire.map_update import decode_map_update, encode_map_update, names_of_update
+
+
+@dataclass(frozen=True)
+class MapOffer:
+    """An encoded map of which only the names have been read.
+
+    Attributes:
+        kind: whole, or for one who has its parent.
+        blob: its bytes.
+        revision: what it calls itself; proven when it is read.
+        parent: what it was made from; empty for a first map.
+    """
+
+    kind: BlobKind
+    blob: bytes
+    revision: bytes
+    parent: bytes
+
+    @classmethod
+    def of(cls, kind: BlobKind, blob: bytes) -> MapOffer:
+        """Read the names.
+
+        Raises:
+            WireError: the bytes do not begin like a map of this kind.
+        """
+        if kind == BlobKind.MAP_UPDATE:
+            return cls(kind, blob, *names_of_update(blob))
+        return cls(kind, blob, revision_of(blob), parent_of(blob))
+
+
+@dataclass(frozen=True, eq=False)
+class ReadyMap:
+    """A map that can be flown on; the fields are those of ``StoredMap``."""
+
+    data: bytes
+    index: MapIndex
+    update: bytes
+
+
+def ready_map(
+    offer: MapOffer, current: StoredMap | None, detector: Detector, features: FeatureOptions
+) -> ReadyMap:
+    """Decode and index; takes a second, beside the event loop, and touches nothing that changes.
+
+    Args:
+        offer: what came or was made.
+        current: the map in use, perhaps its parent.
+        detector: the localization's own.
+        features: how they are found.
+
+    Raises:
+        WireError: the bytes are no map, or need a parent that is not in use here.
+        ValueError: an image cannot be used, or the map is not determined.
+    """
+    has_parent = current is not None and current.revision == offer.parent
+    parent = current.index.landmark_map if current is not None and has_parent else None
+    if offer.kind == BlobKind.MAP:
+        data, update = offer.blob, b""
+    elif parent is None:
+        raise ValueError("an update of a map that is not in use here")
+    else:
+        data, update = decode_map_update(offer.blob, parent), offer.blob
+    index = index_map(decode_map(data), detector, features)
+    if parent is not None and not update:
+        update = encode_map_update(data, parent)
+    return ReadyMap(data, index, update)
