@@ -122,8 +122,15 @@ class FlightLog:
         """Write something that changed."""
         self._write(kind="event", at_ns=self._clock.now_ns(), event=event, reason=reason)
 
-    def map(self, revision: bytes, n_landmarks: int, n_bytes: int, n_keyframes: int) -> None:
-        """Write that another map is flown on."""
+    def map(
+        self,
+        revision: bytes,
+        n_landmarks: int,
+        n_bytes: int,
+        n_keyframes: int,
+        parent: bytes = b"",
+    ) -> None:
+        """Write that another map is flown on, and of which one it was made."""
         self._write(
             kind="map",
             at_ns=self._clock.now_ns(),
@@ -131,6 +138,7 @@ class FlightLog:
             landmarks=n_landmarks,
             bytes=n_bytes,
             keyframes=n_keyframes,
+            parent=parent.hex(),
         )
 
     def close(self, **summary: float) -> None:

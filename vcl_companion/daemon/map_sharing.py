@@ -167,7 +167,13 @@ class MapSharing:
     async def _install(self, data: bytes, index: MapIndex) -> None:
         stored = self._maps.replace(data, index)
         n_keyframes = len(index.landmark_map.keyframes)
-        self._log.map(stored.revision, stored.n_landmarks, len(data), n_keyframes)
+        self._log.map(
+            stored.revision,
+            stored.n_landmarks,
+            len(data),
+            n_keyframes,
+            index.landmark_map.parent,
+        )
         self._log.event("map", f"{stored.n_landmarks} landmarks in {n_keyframes} keyframes")
         _log.info("map %s: %d landmarks", stored.revision.hex(), stored.n_landmarks)
         self._tell_state()
