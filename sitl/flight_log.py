@@ -69,6 +69,7 @@ class MapRow(msgspec.Struct, frozen=True):
     landmarks: int
     bytes: int
     keyframes: int
+    parent: str = ""
 
 
 class SummaryRow(msgspec.Struct, frozen=True):

@@ -7,12 +7,15 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from sitl.flight_log import read_flight_log
+from sitl.flight_log import estimates_of, read_flight_log
 from vcl_companion.clock import ManualClock
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.errors import ConfigError
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import matrix_from_euler
 
 SUMMARY = {
     "cpu_s": 1.5,
@@ -24,7 +27,7 @@ SUMMARY = {
 
 
 def fill(log: FlightLog) -> None:
-    log.frame(0, 100, "localized", latency_ms=12.5, matched=40, inliers=30)
+    log.frame(0, 100, "localized", latency_ms=12.5, matched=40, inliers=30, source="fused")
     log.frame(1, 200, "refused", reason="fog", latency_ms=8.0, matched=3)
     log.frame(2, 300, "dropped")
     log.frame(3, 400, "refused", reason="fog", latency_ms=9.0)
@@ -47,7 +50,7 @@ def test_lines_are_as_specified(tmp_path: Path) -> None:
     log.close(**SUMMARY)
     assert lines(path)[:-1] == before_the_end == [
         {"kind": "frame", "sequence": 0, "captured_at_ns": 100, "outcome": "localized",
-         "reason": None, "latency_ms": 12.5, "matched": 40, "inliers": 30, "source": None},
+         "reason": None, "latency_ms": 12.5, "matched": 40, "inliers": 30, "source": "fused"},
         {"kind": "frame", "sequence": 1, "captured_at_ns": 200, "outcome": "refused",
          "reason": "fog", "latency_ms": 8.0, "matched": 3, "inliers": 0, "source": None},
         {"kind": "frame", "sequence": 2, "captured_at_ns": 300, "outcome": "dropped",
@@ -64,6 +67,25 @@ def test_lines_are_as_specified(tmp_path: Path) -> None:
         "refusals": {"fog": 2},
         **SUMMARY,
     }
+
+
+def test_an_estimate_is_written_as_the_autopilot_would_get_it(tmp_path: Path) -> None:
+    path = tmp_path / "flight.jsonl"
+    log = FlightLog(str(path), ManualClock())
+    pose = Pose(matrix_from_euler(0.0, 0.0, np.pi / 2), np.array([1.0, 2.0, 3.0]))
+    local = np.diag([0.01, 0.04, 0.09, 1e-4, 2e-4, 3e-4])
+    log.estimate(5, pose, local, fused=True)
+    log.estimate(6, pose, local, fused=False, host=2, reason="far off")
+    log.close(**SUMMARY)
+    own, said = read_flight_log(path).estimates
+    assert (own.source, own.host, own.fused, own.reason) == ("intra", None, True, None)
+    assert (said.source, said.host, said.fused, said.reason) == ("inter", 2, False, "far off")
+    assert (said.captured_at_ns, said.position) == (6, (1.0, 2.0, 3.0))
+    read = estimates_of([own])
+    # Heading east, body x lies along world y.
+    expected = np.diag([0.04, 0.01, 0.09, 1e-4, 2e-4, 3e-4])
+    np.testing.assert_allclose(read.covariances[0], expected, atol=1e-12)
+    np.testing.assert_allclose(read.world_from_body[0].rotation, pose.rotation, atol=1e-12)
 
 
 def test_the_report_reads_it(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from vcl_companion.localization.pose_filter import (
     fuse,
     predict,
     started,
+    started_from_proposal,
     update,
 )
 from vcl_companion.localization.pose_history import PoseHistory
@@ -105,6 +106,42 @@ def test_a_starved_drone_takes_what_the_peer_knows() -> None:
     sigma_m = np.sqrt(np.diag(fused.pose_covariance())[:3])
     assert np.all(sigma_m < 0.02)
     assert np.all(sigma_m > 0.002)
+
+
+def test_a_proposal_widens_of_the_speed_only_what_follows_from_the_place() -> None:
+    """A first place a moment ago, a proposal now: between them the speed is known."""
+    far = np.eye(6) * 1e-3
+    state = started_from_proposal(truth_at(0), far, 0, truth_at(0).rotation, OPTIONS)
+    fused = None
+    for k in range(1, 6):
+        predicted = predict(state, k * FRAME_NS, truth_at(k).rotation, OPTIONS)
+        assert predicted is not None
+        fused = fuse(predicted, truth_at(k), sharp(), ARM_M)
+        assert isinstance(fused, FilterState)
+        assert fused.fixed_at_ns == k * FRAME_NS
+        # Never surer of the place than the proposal: all of that may be one error.
+        assert np.all(np.diag(fused.pose_covariance())[:3] > 0.9 * 0.005**2)
+        state = fused
+    speed_sigma = np.sqrt(np.diag(state.covariance)[6:9])
+    # A constant acceleration over the step: 5 mm of place tell it to 0.25 m/s^2.
+    assert np.all(speed_sigma < 1.0)
+    assert np.all(speed_sigma > 0.05)
+    np.testing.assert_allclose(state.velocity_world[:2], [1.5, 0.5], atol=3.0 * speed_sigma.max())
+
+
+def test_without_a_fix_the_frame_of_a_confirming_proposal_is_no_coasting() -> None:
+    history, _ = flown(np.random.default_rng(3), 6)
+    predicted = predict(newest(history), 6 * FRAME_NS, truth_at(6).rotation, OPTIONS)
+    assert predicted is not None
+    history.append(predicted, None, truth_at(6).rotation)
+    assert history.own_fix_at(6 * FRAME_NS) is None
+    assert history.own_fix_at(5 * FRAME_NS) is not None
+    confirmed = history.fuse(6 * FRAME_NS, truth_at(6), np.eye(6), ARM_M)
+    assert isinstance(confirmed, FilterState)
+    assert (predicted.fixed_at_ns, confirmed.fixed_at_ns) == (5 * FRAME_NS, 6 * FRAME_NS)
+    np.testing.assert_array_equal(confirmed.covariance, predicted.covariance)
+    assert history.at(6 * FRAME_NS) is confirmed
+    assert history.at(7 * FRAME_NS) is None
 
 
 def test_the_same_opinion_twice_is_no_news() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -170,7 +171,8 @@ class Companion:
             self._options.localization,
         )
         refused = self._take(frame, fix, ned_from_body)
-        asked = self._inter.begin(frame, ned_from_body, stored.revision, refused is not None)
+        sigma_m = math.inf if refused else self._estimator.sigma_m
+        asked = self._inter.begin(frame, ned_from_body, stored.revision, sigma_m)
         if asked is not None:
             return asked, refused
         if refused is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -68,6 +69,14 @@ class Estimator:
         """Whether a frame of the last two seconds gave a pose, by a fix or by a proposal."""
         state = self._history.newest
         return state is not None and now_ns - state.fixed_at_ns <= _FRESH_NS
+
+    @property
+    def sigma_m(self) -> float:
+        """Our newest position's 1 sigma in its worst direction, m; infinite without a state."""
+        state = self._history.newest
+        if state is None:
+            return math.inf
+        return float(np.sqrt(np.linalg.eigvalsh(state.pose_covariance()[:3, :3])[-1]))
 
     def own_fix_at(self, at_ns: int) -> FilterState | None:
         """Return what was believed at a frame that had a fix of its own; None at any other."""

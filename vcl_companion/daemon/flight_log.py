@@ -125,7 +125,7 @@ class FlightLog:
     def map(
         self, revision: bytes, parent: bytes, n_landmarks: int, n_bytes: int, n_keyframes: int
     ) -> None:
-        """Write that another map is flown on."""
+        """Write that another map is flown on, and of which one it was made."""
         self._write(
             kind="map",
             at_ns=self._clock.now_ns(),

@@ -106,7 +106,7 @@ class InterTarget:
         self._asked: dict[int, Asked] = {}
 
     def begin(
-        self, frame: Frame, ned_from_body: Array | None, revision: bytes, is_lost: bool
+        self, frame: Frame, ned_from_body: Array | None, revision: bytes, sigma_m: float
     ) -> Asked | None:
         """Decide whether a frame is asked about; call ``ask`` with what is returned.
 
@@ -114,14 +114,16 @@ class InterTarget:
             frame: the newest.
             ned_from_body: (3, 3) its attitude, or None.
             revision: of our map.
-            is_lost: it was refused.
+            sigma_m: of our position at it, in its worst direction; infinite when
+                the frame was refused.
 
         Returns:
             The request, or None: not due, one is open, or nobody can be asked.
         """
-        self._n_since += not is_lost
+        self._n_since += math.isfinite(sigma_m)
         every_n = self._options.every_n_frames
-        if every_n == 0 or self._is_open or not (is_lost or self._n_since >= every_n):
+        is_due = sigma_m > self._options.weak_sigma_m or self._n_since >= every_n
+        if every_n == 0 or self._is_open or not is_due:
             return None
         hosts = self._hosts.choose(revision, self._options.max_hosts)
         if not hosts:

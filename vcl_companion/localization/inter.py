@@ -31,8 +31,8 @@ from vcl_companion.vision.matching import MatchOptions, match_guided, match_mutu
 from vcl_companion.vision.triangulation import triangulate
 
 _SAME_LANDMARK_PX = 3.0
-# A hypothesis that costs this much more is e^-10 times as likely.
-_RIVAL_COST = 20.0
+# What one wrong match that happens to lie on a line is worth to a hypothesis.
+_ONE_MATCH = 9.0
 _MAX_ROUNDS = 5
 
 
@@ -112,11 +112,10 @@ def localize_inter(
     # By the total cost over all matches, never by the smallest sigma: that chooses
     # the planar twin.
     best = min(usable, key=lambda s: s.cost)
-    rivals = [s for s in usable if s.cost - best.cost < _RIVAL_COST]
     covariance = pair.covariance(best.world_from_body, best.chosen, host_covariance)
     if not np.all(np.isfinite(covariance)):
         return NoProposal("what both see does not fix the target's pose")
-    covariance = covariance + _spread(best, rivals)
+    covariance = covariance + _spread(best, usable)
     covariance = 0.5 * (covariance + covariance.T)
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
     if not sigma_m <= options.max_sigma_m:
@@ -145,12 +144,13 @@ def _spread(best: _Placed, rivals: list[_Placed]) -> Array:
     """Return (6, 6) how far apart hypotheses are that explain the matches nearly as well.
 
     With few matches the cost has several minima close to each other, and the
-    slope at one of them knows nothing of the next.
+    slope at one of them knows nothing of the next. Which is the lowest may be up
+    to a single wrong match.
     """
     spread = np.zeros((6, 6))
     total = 0.0
     for rival in rivals:
-        weight = float(np.exp(-0.5 * (rival.cost - best.cost)))
+        weight = float(np.exp(-0.5 * (rival.cost - best.cost) / _ONE_MATCH))
         off = best.world_from_body.local(rival.world_from_body)
         spread += weight * np.outer(off, off)
         total += weight

@@ -16,6 +16,7 @@ class InterMavOptions(InterOptions):
     Attributes:
         every_n_frames: localized frames from one request to the next; a frame
             that is refused asks anyway. 0: never asks, still answers.
+        weak_sigma_m: a localized frame whose pose is less certain than this asks too.
         wait_s: a refused frame waits this long for an answer.
         max_hosts: peers asked at once.
         detector: features to match two drones' images by; among the map's.
@@ -23,6 +24,7 @@ class InterMavOptions(InterOptions):
     """
 
     every_n_frames: int = 10
+    weak_sigma_m: float = 0.3
     wait_s: float = 1.0
     max_hosts: int = 2
     detector: Detector = "sift"
@@ -32,6 +34,8 @@ class InterMavOptions(InterOptions):
         super().__post_init__()
         if not 0 <= self.every_n_frames <= 100_000:
             raise ValueError(f"every_n_frames must lie in 0..100000, got {self.every_n_frames}")
+        if not self.weak_sigma_m > 0:
+            raise ValueError(f"weak_sigma_m must be positive, got {self.weak_sigma_m}")
         if not 0 < self.wait_s <= 60.0:
             raise ValueError(f"wait_s must be above 0 up to 60, got {self.wait_s}")
         if not 1 <= self.max_hosts <= 16:
