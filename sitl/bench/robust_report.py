@@ -90,7 +90,7 @@ def _markdown(
     )
     yield ""
     if unfinished:
-        yield f"Not finished: {unfinished} parts are still to come."
+        yield f"Not finished: {unfinished} parts are still to come. So far, against who has run:"
         yield ""
     yield _summary(judged)
     yield ""
