@@ -24,7 +24,7 @@ Mask = NDArray[np.bool_]
 
 # 99 % of a two-dimensional Gaussian lies within this squared Mahalanobis distance.
 _CHI2_2_99 = 9.21
-_MAX_LEVERAGE = 0.4
+_MAX_LEVERAGE = 0.25
 # Variance of the robust estimate over that of its weights taken as fixed, for Gaussian
 # noise in two dimensions: E[w^2 s/2] E[w]^2 / (E[w + s w']^2 E[w^2]) with w = (1 + s/4)^-2.
 _ROBUST_LOSS = 1.1136
