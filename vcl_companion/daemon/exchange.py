@@ -363,11 +363,11 @@ class Exchange:
             joined = isinstance(event, PeerJoined)
             self._log.event("peer", f"drone {event.peer} {'joined' if joined else 'lost'}")
             _log.info("drone %d %s", event.peer, "joined" if joined else "is silent")
-            if not joined:
-                self.inter.lost(event.peer)
             if joined:
                 self._sharing.forgot(event.peer)
                 self._tell_state()
+            else:
+                self.inter.lost(event.peer)
 
     def _now_s(self) -> float:
         return asyncio.get_running_loop().time()
