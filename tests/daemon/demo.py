@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vcl_companion.cameras.source import Frame
+from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_building import Distances, build_map, update_map
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.camera import Camera
@@ -108,7 +109,7 @@ def encoded_map(*system_ids: int) -> bytes:
     """The map of the first frames of some drones."""
     built = build_map(
         [answer(system_id) for system_id in system_ids], LEADER, known_distances(*system_ids),
-        MAP_OPTIONS, FEATURES,
+        MAP_OPTIONS, FeatureMemory(FEATURES),
     )  # fmt: skip
     assert isinstance(built, LandmarkMap)
     return encode_map(built)
@@ -119,7 +120,7 @@ def encoded_update() -> bytes:
     """The next revision of the map of 1 and 2, with a later frame of all three."""
     stored = StoredMap(revision_of(encoded_map(1, 2)), encoded_map(1, 2), map_index(1, 2))
     frames = [answer(system_id, 12) for system_id in (1, 2, 3)]
-    made = update_map(stored, frames, MAP_OPTIONS, FEATURES)
+    made = update_map(stored, frames, MAP_OPTIONS, FeatureMemory(FEATURES))
     assert isinstance(made, LandmarkMap)
     return encode_map(made)
 

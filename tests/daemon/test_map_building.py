@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from tests.daemon import demo
+from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_building import build_map
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.mapping.drone_view import encode_image
@@ -18,7 +19,9 @@ DISTANCES = demo.known_distances(1, 2)
 
 
 def built(*frames: FrameAnswer) -> LandmarkMap | NoMap:
-    return build_map(list(frames), demo.LEADER, DISTANCES, demo.MAP_OPTIONS, demo.FEATURES)
+    return build_map(
+        list(frames), demo.LEADER, DISTANCES, demo.MAP_OPTIONS, FeatureMemory(demo.FEATURES)
+    )
 
 
 def reason(result: LandmarkMap | NoMap) -> str:
@@ -61,7 +64,11 @@ def test_what_is_missing_is_named() -> None:
     blank = replace(demo.answer(2), image_bytes=encode_image(demo.blank(2), 80))
     assert "drones 1 and 2 see too little" in reason(built(demo.answer(1), blank))
     strangers = build_map(
-        [demo.answer(1), demo.answer(2)], 1, ((1, 3, 2.0),), demo.MAP_OPTIONS, demo.FEATURES
+        [demo.answer(1), demo.answer(2)],
+        1,
+        ((1, 3, 2.0),),
+        demo.MAP_OPTIONS,
+        FeatureMemory(demo.FEATURES),
     )
     assert "the scale is unknown" in reason(strangers)
 

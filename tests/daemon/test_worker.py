@@ -53,12 +53,19 @@ def test_what_waits_at_the_end_is_cancelled_when_it_is_asked_for() -> None:
     assert running.result(5.0)
 
 
-def test_the_process_ends_though_something_is_still_being_done() -> None:
+@pytest.mark.parametrize("status", [0, 1])
+def test_the_process_ends_though_something_is_still_being_done(status: int) -> None:
     code = (
-        "import time; from vcl_companion.daemon.worker import Worker; w = Worker('mapping'); "
-        "w.submit(time.sleep, 600.0); w.shutdown(wait=False, cancel_futures=True); print('over')"
+        "import threading, cv2, numpy as np; from vcl_companion.daemon.worker import Worker\n"
+        "began = threading.Event()\n"
+        "image = np.random.default_rng(0).integers(0, 255, (1500, 1500), dtype=np.uint8)\n"
+        "def work():\n"
+        "    began.set()\n"
+        "    while True: cv2.AKAZE_create().detectAndCompute(image, None)\n"
+        "w = Worker('mapping'); w.submit(work); w.submit(work); began.wait()\n"
+        f"w.shutdown(wait=False, cancel_futures=True); w.exit_status = {status}; print('over')"
     )
     ended = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60.0, check=False
     )
-    assert (ended.returncode, ended.stdout) == (0, "over\n")
+    assert (ended.returncode, ended.stdout, ended.stderr) == (status, "over\n", "")

@@ -170,6 +170,7 @@ async def _run(config: Config) -> int:
                 peer_bytes_sent=peers.counters.bytes_out,
                 peer_bytes_received=peers.counters.bytes_in,
             )
+    vision.exit_status = mapping.exit_status = 0
     return 0
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
 from vcl_companion.daemon.estimator import Estimator
+from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_answers import FrameAnswers, WantedFrame
 from vcl_companion.daemon.frame_history import FrameHistory
@@ -121,6 +122,7 @@ class Exchange:
             system_id, self._frames, autopilot, sensor, clock, executor,
             options.map.keyframe_quality,
         )  # fmt: skip
+        memory = FeatureMemory(options.features)
         self._rounds = MapRounds(
             group,
             self._frames,
@@ -132,9 +134,7 @@ class Exchange:
             log,
             clock,
             executor,
-            RoundOptions(
-                options.swarm.known_distances, options.map, options.update, options.features
-            ),
+            RoundOptions(options.swarm.known_distances, options.map, options.update, memory),
             rng,
         )
         self._sharing = MapSharing(
@@ -147,6 +147,7 @@ class Exchange:
             self._refusals.count,
             options.detector,
             options.features,
+            memory,
             options.update.delivery_wait_s,
         )
         self.inter = InterTarget(

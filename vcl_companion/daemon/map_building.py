@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.rotation import matrix_from_quaternion
-from vcl_companion.mapping.drone_view import DroneView, decode_image
+from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.reconstruction import reconstruct
-from vcl_companion.mapping.update import extend_map
-from vcl_companion.vision.features import FeatureOptions, detect
+from vcl_companion.mapping.update import extended
 from vcl_companion.wire.frame_codec import FrameAnswer
 
 Distances = tuple[tuple[int, int, float], ...]
@@ -20,7 +20,7 @@ def build_map(
     leader: int,
     known_distances: Distances,
     map_options: MapOptions,
-    features: FeatureOptions,
+    memory: FeatureMemory,
 ) -> LandmarkMap | NoMap:
     """Build the first map of a round's frames; takes a second or two.
 
@@ -29,7 +29,7 @@ def build_map(
         leader: system id of the drone whose body is the world's origin.
         known_distances: (drone, drone, metres).
         map_options: thresholds.
-        features: how they are found.
+        memory: finds features.
 
     Returns:
         A map, or why there is none. A frame whose image cannot be used is left
@@ -37,7 +37,7 @@ def build_map(
     """
     views: list[DroneView] = []
     for frame in sorted(frames, key=lambda f: f.drone_id):
-        view = _view(frame, map_options, features)
+        view = _view(frame, map_options, memory)
         if isinstance(view, DroneView):
             views.append(view)
         elif frame.drone_id == leader:
@@ -49,7 +49,7 @@ def update_map(
     stored: StoredMap,
     frames: list[FrameAnswer],
     map_options: MapOptions,
-    features: FeatureOptions,
+    memory: FeatureMemory,
 ) -> LandmarkMap | NoMap:
     """Build the next revision of a map of a round's frames (IV-G); takes some seconds.
 
@@ -57,28 +57,33 @@ def update_map(
         stored: the map in use.
         frames: of each drone that answered, several of some.
         map_options: thresholds.
-        features: how they are found.
+        memory: finds features.
 
     Returns:
         A map whose parent is ``stored``, or why there is none. A frame whose
         image cannot be used, or that came twice, is left out.
     """
     shown = {(f.drone_id, f.captured_at_ns): f for f in frames}
-    made = [_view(shown[key], map_options, features) for key in sorted(shown)]
+    made = [_view(shown[key], map_options, memory) for key in sorted(shown)]
     views = [view for view in made if isinstance(view, DroneView)]
     if not views:
         return NoMap("no frame has come that can be used")
-    return extend_map(
-        stored.index.landmark_map, stored.revision, views, map_options, features=features
+    return extended(
+        stored.index.landmark_map,
+        stored.revision,
+        views,
+        lambda keyframe: memory.of_keyframe(keyframe, map_options.detectors),
+        map_options,
     )
 
 
-def _view(
-    frame: FrameAnswer, map_options: MapOptions, features: FeatureOptions
-) -> DroneView | NoMap:
+def _view(frame: FrameAnswer, map_options: MapOptions, memory: FeatureMemory) -> DroneView | NoMap:
     """Make of a frame what the map builder needs, or say why it cannot be used."""
     try:
-        image = decode_image(frame.image_bytes, frame.camera)
+        features = tuple(
+            memory.features(frame.image_bytes, frame.camera, detector)
+            for detector in map_options.detectors
+        )
     except ValueError as error:
         return NoMap(str(error))
     attitude = frame.ned_from_body
@@ -89,5 +94,5 @@ def _view(
         frame.body_from_cam,
         None if attitude is None else matrix_from_quaternion(attitude),
         frame.image_bytes,
-        tuple(detect(image, detector, features) for detector in map_options.detectors),
+        features,
     )

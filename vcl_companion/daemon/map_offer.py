@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.localization.map_index import MapIndex, index_map
-from vcl_companion.vision.features import Detector, FeatureOptions
+from vcl_companion.mapping.landmark_map import Keyframe
+from vcl_companion.vision.features import Detector, FeatureOptions, Features
 from vcl_companion.wire.header import BlobKind
 from vcl_companion.wire.map_codec import decode_map, parent_of, revision_of
 from vcl_companion.wire.map_update import decode_map_update, encode_map_update, names_of_update
@@ -50,15 +52,20 @@ class ReadyMap:
 
 
 def ready_map(
-    offer: MapOffer, current: StoredMap | None, detector: Detector, features: FeatureOptions
+    offer: MapOffer,
+    current: StoredMap | None,
+    detector: Detector,
+    features: FeatureOptions,
+    memory: FeatureMemory,
 ) -> ReadyMap:
-    """Decode and index; takes a second, beside the event loop, and touches nothing that changes.
+    """Decode and index; takes a second, beside the event loop.
 
     Args:
         offer: what came or was made.
         current: the map in use, perhaps its parent.
         detector: the localization's own.
         features: how they are found.
+        memory: finds them.
 
     Raises:
         WireError: the bytes are no map, or need a parent that is not in use here.
@@ -72,7 +79,11 @@ def ready_map(
         raise ValueError("an update of a map that is not in use here")
     else:
         data, update = decode_map_update(offer.blob, parent), offer.blob
-    index = index_map(decode_map(data), detector, features)
+
+    def features_of(keyframe: Keyframe) -> Features:
+        return memory.features(keyframe.image_bytes, keyframe.camera, detector)
+
+    index = index_map(decode_map(data), detector, features, features_of)
     if parent is not None and not update:
         update = encode_map_update(data, parent)
     return ReadyMap(data, index, update)

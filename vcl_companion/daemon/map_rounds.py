@@ -18,6 +18,7 @@ import numpy as np
 
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
+from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.gathering import Gathering, Wanted
@@ -27,7 +28,6 @@ from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.updates import UpdateOptions, UpdateTrigger
-from vcl_companion.vision.features import FeatureOptions
 from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.messages import FrameRequest
 
@@ -52,13 +52,13 @@ class RoundOptions:
         known_distances: (drone, drone, metres).
         map: thresholds of the building.
         update: when and how maps are updated.
-        features: how they are found.
+        memory: finds features; only the executor's thread uses it.
     """
 
     known_distances: Distances
     map: MapOptions
     update: UpdateOptions
-    features: FeatureOptions
+    memory: FeatureMemory
 
 
 class MapRounds:
@@ -164,7 +164,7 @@ class MapRounds:
 
         def build(frames: list[FrameAnswer]) -> LandmarkMap | NoMap:
             distances = options.known_distances
-            return build_map(frames, leader, distances, options.map, options.features)
+            return build_map(frames, leader, distances, options.map, options.memory)
 
         request_id = self._gathering.begin()
         wanted = Wanted(frame.captured_at_ns, timeout_s=options.map.gather_timeout_s)
@@ -182,7 +182,7 @@ class MapRounds:
         _log.info("the map is updated, %s", reason)
 
         def build(frames: list[FrameAnswer]) -> LandmarkMap | NoMap:
-            return update_map(stored, frames, options.map, options.features)
+            return update_map(stored, frames, options.map, options.memory)
 
         request_id = self._gathering.begin()
         wanted = Wanted(

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
+from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.mailbox import PeerMailbox
 from vcl_companion.daemon.map_offer import MapOffer, ReadyMap, ready_map
@@ -60,6 +61,7 @@ class MapSharing:
         refuse: counts what a peer sent in vain: peer, kind, detail.
         detector: the localization's own.
         features: how they are found.
+        memory: finds them; only the executor's thread uses it.
         delivery_wait_s: how long a coordinator that is back with a map which we
             have left may take to be brought up to date; then it has its way.
     """
@@ -75,6 +77,7 @@ class MapSharing:
         refuse: Callable[[int, str, str], None],
         detector: Detector,
         features: FeatureOptions,
+        memory: FeatureMemory,
         delivery_wait_s: float,
     ) -> None:
         self._group = group
@@ -86,6 +89,7 @@ class MapSharing:
         self._refuse = refuse
         self._detector: Detector = detector
         self._features = features
+        self._memory = memory
         self._delivery_wait_s = delivery_wait_s
         self._offered: PeerMailbox[MapOffer] = PeerMailbox()
         self._handed: dict[int, _Handed] = {}
@@ -237,7 +241,13 @@ class MapSharing:
         loop = asyncio.get_running_loop()
         try:
             return await loop.run_in_executor(
-                self._executor, ready_map, offer, self._maps.current, self._detector, self._features
+                self._executor,
+                ready_map,
+                offer,
+                self._maps.current,
+                self._detector,
+                self._features,
+                self._memory,
             )
         except (WireError, ValueError) as error:
             return NoMap(str(error))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
+import os
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
@@ -18,12 +21,19 @@ class Worker(Executor):
 
     The standard library's pool makes the interpreter wait for what its threads
     still do; an update of a map takes seconds, and who ends the service has
-    only so much patience.
+    only so much patience. Nor may the interpreter take such a thread down with
+    it: native code under way would abort. So a process whose worker still works
+    ends on the spot, when everything else has been put in order.
+
+    Attributes:
+        exit_status: of a process that ends so.
     """
 
     def __init__(self, name: str) -> None:
         self._queue: SimpleQueue[_Work | None] = SimpleQueue()
         self._is_shut = False
+        self._is_busy = False
+        self.exit_status = 1
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
@@ -42,6 +52,7 @@ class Worker(Executor):
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Take nothing more; what waits is cancelled, or done first."""
         self._is_shut = True
+        atexit.register(self._end_if_busy)
         while cancel_futures:
             try:
                 work = self._queue.get_nowait()
@@ -58,10 +69,18 @@ class Worker(Executor):
             future, do = work
             if not future.set_running_or_notify_cancel():
                 continue
+            self._is_busy = True
             try:
                 result = do()
             except BaseException as error:  # the future's owner is told, whatever it is
                 future.set_exception(error)
             else:
                 future.set_result(result)
+            self._is_busy = False
             del work, future, do
+
+    def _end_if_busy(self) -> None:
+        if self._is_busy:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(self.exit_status)

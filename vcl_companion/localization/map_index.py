@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.drone_view import decode_image
-from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
 from vcl_companion.vision.features import Detector, FeatureOptions, Features, detect
 
@@ -39,7 +40,12 @@ class MapIndex:
     detector: Detector
 
 
-def index_map(landmark_map: LandmarkMap, detector: Detector, options: FeatureOptions) -> MapIndex:
+def index_map(
+    landmark_map: LandmarkMap,
+    detector: Detector,
+    options: FeatureOptions,
+    features_of: Callable[[Keyframe], Features] | None = None,
+) -> MapIndex:
     """Derive descriptors from the keyframe images, and the covariance from the geometry.
 
     Args:
@@ -47,13 +53,18 @@ def index_map(landmark_map: LandmarkMap, detector: Detector, options: FeatureOpt
         detector: the localization's own; landmarks of other detectors serve
             the geometry only.
         options: as used when the map was built.
+        features_of: knows what this detector finds in a keyframe; None: it is looked for.
 
     Raises:
         ValueError: an image cannot be decoded, or the map is not determined.
     """
     descriptors, pixels, owners = [], [], []
     for i, keyframe in enumerate(landmark_map.keyframes):
-        features = detect(decode_image(keyframe.image_bytes, keyframe.camera), detector, options)
+        if features_of is None:
+            image = decode_image(keyframe.image_bytes, keyframe.camera)
+            features = detect(image, detector, options)
+        else:
+            features = features_of(keyframe)
         seen = np.flatnonzero(landmark_map.seen[:, i])
         if len(features) == 0 or len(seen) == 0:
             continue

@@ -19,7 +19,7 @@ _WINDOW_S = 1.0
 # A new map is not judged by less than this share of the window.
 _JUDGED_SHARE = 0.5
 # An update that did not help is followed by a longer pause, up to so many intervals.
-_MAX_PAUSE = 4.0
+_MAX_PAUSE = 8.0
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class UpdateOptions:
             has seen of this revision; 0 for both of them: maps stay as they are.
         hold_s: how long the majority has to want it.
         interval_s: shortest time from the end of one round, or from a new revision,
-            to the next round; up to four times as long while rounds do not help.
+            to the next round; up to eight times as long while rounds do not help.
         gather_timeout_s: how long a round waits for the members' frames.
         delivery_wait_s: how long a revision may take to reach everybody alive
             before the next round, and how long a peer that claims a map may take
@@ -45,11 +45,11 @@ class UpdateOptions:
     # A round takes seconds, and in fast flight landmarks halve in five: after two halvings
     # there must still be more than localization needs (15).
     tracked: int = 100
-    # Beside its own keyframe a map is seen half as well again as from anywhere else: a third
-    # of the most that was seen is half of what is usual.
-    share: float = 0.35
-    hold_s: float = 1.0
-    interval_s: float = 5.0
+    # Beside its own keyframe a map is seen half as well again as from anywhere else, so half
+    # of the most is two thirds of what is usual: it has to be early, for the same reason.
+    share: float = 0.5
+    hold_s: float = 0.5
+    interval_s: float = 2.0
     gather_timeout_s: float = 5.0
     delivery_wait_s: float = 30.0
     lost_s: float = 3.0

@@ -1,0 +1,59 @@
+"""The features of images that maps are made of, found once however often a map is touched.
+
+A round, the index of what it made, and the next round look at the same images
+again and again; finding their features was half of an update's time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vcl_companion.geometry.camera import Camera
+from vcl_companion.mapping.drone_view import decode_image
+from vcl_companion.mapping.landmark_map import Keyframe
+from vcl_companion.vision.features import Detector, FeatureOptions, Features, detect
+
+# About one and a half megabytes each with AKAZE and SIFT; a map has at most two dozen.
+_N_IMAGES = 40
+
+
+class FeatureMemory:
+    """Remembers the features of the images asked for last; for one thread.
+
+    Args:
+        options: how they are found.
+        n_images: how many images are remembered.
+    """
+
+    def __init__(self, options: FeatureOptions, n_images: int = _N_IMAGES) -> None:
+        self._options = options
+        self._n_images = n_images
+        self._known: dict[tuple[bytes, int, int], dict[Detector, Features]] = {}
+
+    def features(self, image_bytes: bytes, camera: Camera, detector: Detector) -> Features:
+        """Return what a detector finds in an encoded image.
+
+        Raises:
+            ValueError: it is no image, or not one of this camera.
+        """
+        key = (image_bytes, camera.width_px, camera.height_px)
+        known = self._known.pop(key, {})
+        if detector not in known:
+            known[detector] = detect(decode_image(image_bytes, camera), detector, self._options)
+        self._known[key] = known  # the last one asked for is the last to go
+        while len(self._known) > self._n_images:
+            del self._known[next(iter(self._known))]
+        return known[detector]
+
+    def of_keyframe(
+        self, keyframe: Keyframe, detectors: tuple[Detector, ...]
+    ) -> tuple[Features, ...]:
+        """Return what each detector finds in a keyframe; nothing where its image is none."""
+        try:
+            return tuple(
+                self.features(keyframe.image_bytes, keyframe.camera, detector)
+                for detector in detectors
+            )
+        except ValueError:
+            nothing = np.zeros((1, 1), np.uint8)
+            return tuple(detect(nothing, detector, self._options) for detector in detectors)
