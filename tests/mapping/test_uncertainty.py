@@ -14,13 +14,13 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import KnownDistance, LandmarkMap
-from vcl_companion.mapping.uncertainty import map_uncertainty, views_of
+from vcl_companion.mapping.uncertainty import NOISE_FLOOR_PX, map_uncertainty, views_of
 from vcl_companion.vision.bundle import BundleOptions, Distance, adjust, normal_equations
 
 
 def dense_covariance(landmark_map: LandmarkMap) -> Array:
     """Invert the whole normal matrix: keyframes 1 to V-1, then every landmark."""
-    noise = landmark_map.pixel_noise_px
+    noise = max(landmark_map.pixel_noise_px, NOISE_FLOOR_PX)
     views = views_of(landmark_map)
     system = normal_equations(replace(views, slopes=views.slopes / noise), None)
     n_poses, n_points = len(system.pose_block), len(system.point_block)
@@ -91,7 +91,7 @@ def noisy_map(rng: np.random.Generator, scene: Scene, sigma_m: float) -> Landmar
 
 def test_keyframes_and_landmarks_err_as_much_as_stated() -> None:
     rng = np.random.default_rng(7)
-    scene = replace(facade_scene(rng, 60, relief_m=4.0, n_views=3), noise_px=0.4)
+    scene = replace(facade_scene(rng, 60, relief_m=4.0, n_views=3), noise_px=0.6)
     truth = map_of(scene)
     poses, pose_sigma, points, point_sigma = [], [], [], []
     for _ in range(60):
@@ -124,6 +124,16 @@ def test_a_better_known_distance_is_a_better_scale() -> None:
         covariance = map_uncertainty(map_of(scene, sigma_m)).keyframe_covariance[6:, 6:]
         along_m = float(np.sqrt(direction @ covariance @ direction))
         assert along_m == pytest.approx(sigma_m, rel=0.01)
+
+
+def test_a_map_is_never_taken_for_surer_than_detectors_are() -> None:
+    good = map_of(facade_scene(np.random.default_rng(0), 40, n_views=3))
+    floor, silent, loud = (
+        map_uncertainty(replace(good, pixel_noise_px=noise_px)).keyframe_covariance[6:, 6:]
+        for noise_px in (NOISE_FLOOR_PX, 1e-300, 2.0 * NOISE_FLOOR_PX)
+    )
+    np.testing.assert_array_equal(silent, floor)
+    assert np.trace(loud) > 2.0 * np.trace(floor)
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.distortion_model)
@@ -171,7 +181,6 @@ def degenerate_maps() -> dict[str, LandmarkMap]:
         "landmarks at infinity": replace(good, points_world=good.points_world * 1e9),
         "no landmarks": empty,
         "one keyframe": single,
-        "no noise to speak of": replace(good, pixel_noise_px=1e-300),
         "endless noise": replace(good, pixel_noise_px=1e300),
         "an absurd lens": replace(
             good, keyframes=tuple(replace(k, camera=wide) for k in good.keyframes)

@@ -28,8 +28,8 @@ from vcl_companion.mapping.visibility import match_features
 from vcl_companion.vision.features import FeatureOptions
 from vcl_companion.vision.resection import NotFound
 
-# Keyframes that a view is matched with at once, and altogether, before it is given up.
-_BATCH, _TRIED = 3, 6
+# Keyframes that a view is matched with before it is given up.
+_TRIED = 6
 # A registered view is matched with this many keyframes that overlap it most.
 _PARTNERS = 2
 # Overlap counts fully from this angle between two rays on, and hardly where they are parallel.
@@ -136,16 +136,14 @@ class _Update:
     def _join_old(self, i: int) -> None:
         """Register a view by landmarks of the old map."""
         view, links = self._views[i], PairMatches(np.zeros(0, np.intp), np.zeros(0, np.intp))
-        order = self._likely(view)[:_TRIED]
-        for start in range(0, len(order), _BATCH):
-            for k in order[start : start + _BATCH]:
-                matches = self._match_keyframe(k, i)
-                landmark = self._library.of(k).landmark[matches.a]
-                of_map = landmark >= 0
-                links = PairMatches(
-                    np.concatenate([links.a, landmark[of_map]]),
-                    np.concatenate([links.b, matches.b[of_map]]),
-                )
+        for k in self._likely(view)[:_TRIED]:
+            matches = self._match_keyframe(k, i)
+            landmark = self._library.of(k).landmark[matches.a]
+            of_map = landmark >= 0
+            links = PairMatches(
+                np.concatenate([links.a, landmark[of_map]]),
+                np.concatenate([links.b, matches.b[of_map]]),
+            )
             found = join(view, _unique(links), self._old, self._sure, self._options)
             if isinstance(found, Joined):
                 found = join_nearby(

@@ -41,12 +41,14 @@ def match_mutual(a: Features, b: Features, options: MatchOptions) -> tuple[Index
     if len(a) < 2 or len(b) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     matcher = cv2.BFMatcher(_norm(a))
-    forward = _knn(matcher, a, b, 2)
-    backward = _knn(matcher, b, a, 1)
-    best, distance = forward
-    ids = np.arange(len(a))
-    ok = (distance[:, 0] < options.ratio * distance[:, 1]) & (backward[0][best[:, 0], 0] == ids)
-    return ids[ok], best[ok, 0]
+    best, distance = _knn(matcher, a, b, 2)
+    clear = np.flatnonzero(distance[:, 0] < options.ratio * distance[:, 1])
+    if len(clear) == 0:
+        return clear, clear
+    chosen, which = np.unique(best[clear, 0], return_inverse=True)
+    backward, _ = _knn(matcher, b.subset(chosen), a, 1)
+    mutual = backward[which, 0] == clear
+    return clear[mutual], best[clear[mutual], 0]
 
 
 def match_to_entries(
