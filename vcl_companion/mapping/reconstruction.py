@@ -9,18 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from vcl_companion.geometry.pose import Pose
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.scale import metric
-from vcl_companion.mapping.scene import Scene, adjusted, register_next
-from vcl_companion.mapping.tracks import (
-    ideal_of_pixels,
-    join_tracks,
-    pixels_of_tracks,
-    slopes_of_ideal,
-)
+from vcl_companion.mapping.scene import grown_from
+from vcl_companion.mapping.tracks import pixels_of_tracks
 from vcl_companion.mapping.uncertainty import map_uncertainty
 from vcl_companion.mapping.visibility import Edge, visibility_graph
 from vcl_companion.vision.essential import RelativePose
@@ -78,22 +72,10 @@ def _build(
     distances_m: list[tuple[int, int, float]],
     options: MapOptions,
 ) -> LandmarkMap | NoMap:
-    """Triangulate the seed pair, register the others, adjust, make it metric."""
-    tracks = join_tracks([len(d.pixels) for d in drones], {p: e.matches for p, e in graph.items()})
+    """Grow a scene from the seed pair, make it metric."""
+    matches = {p: edge.matches for p, edge in graph.items()}
+    scene, tracks = grown_from(drones, pair, chosen.b_from_a, matches, options)
     observed = pixels_of_tracks(tracks, [d.pixels for d in drones])
-    ideal = ideal_of_pixels(observed, [d.camera for d in drones])
-    scene = Scene(
-        ideal,
-        slopes_of_ideal(ideal, [d.camera for d in drones]),
-        np.full((len(ideal), 3), np.nan),
-        {pair[0]: Pose.identity(), pair[1]: chosen.b_from_a.inverse()},
-    )
-    scene = adjusted(scene, options)
-    while True:
-        extended = register_next(drones, scene, options)
-        if extended is None:
-            break
-        scene = adjusted(extended, options)
     made = metric(drones, scene, observed, distances_m, options)
     return accepted(made, options) if isinstance(made, LandmarkMap) else made
 

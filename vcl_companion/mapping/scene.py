@@ -12,6 +12,13 @@ from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.culling import decisive, fitting, placed
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.options import MapOptions
+from vcl_companion.mapping.tracks import (
+    PairMatches,
+    ideal_of_pixels,
+    join_tracks,
+    pixels_of_tracks,
+    slopes_of_ideal,
+)
 from vcl_companion.vision.bundle import (
     BundleOptions,
     Distance,
@@ -35,6 +42,41 @@ class Scene:
     slopes: Array
     points: Array
     cams: dict[int, Pose]
+
+
+def grown_from(
+    drones: list[DroneView],
+    pair: tuple[int, int],
+    b_from_a: Pose,
+    matches: dict[tuple[int, int], PairMatches],
+    options: MapOptions,
+) -> tuple[Scene, NDArray[np.intp]]:
+    """Triangulate a seed pair, register view after view, adjust each time.
+
+    Args:
+        drones: all views.
+        pair: the seed, two of them.
+        b_from_a: the relative pose of its cameras.
+        matches: that agree, of all pairs of views.
+        options: thresholds.
+
+    Returns:
+        The scene with the views that could be registered, and the (N, V) tracks
+        its landmarks are: feature of each view, -1 where unseen.
+    """
+    tracks = join_tracks([len(d.pixels) for d in drones], matches)
+    cameras = [d.camera for d in drones]
+    ideal = ideal_of_pixels(pixels_of_tracks(tracks, [d.pixels for d in drones]), cameras)
+    start = Scene(
+        ideal,
+        slopes_of_ideal(ideal, cameras),
+        np.full((len(ideal), 3), np.nan),
+        {pair[0]: Pose.identity(), pair[1]: b_from_a.inverse()},
+    )
+    scene = adjusted(start, options)
+    while (extended := register_next(drones, scene, options)) is not None:
+        scene = adjusted(extended, options)
+    return scene, tracks
 
 
 def adjusted(scene: Scene, options: MapOptions) -> Scene:

@@ -20,13 +20,13 @@ from vcl_companion.mapping.growth import Growth, Pairs, grown
 from vcl_companion.mapping.joining import Joined, join, join_nearby
 from vcl_companion.mapping.known_features import FeaturesOf, KeyframeLibrary, detected
 from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.late_joining import join_together
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.reconstruction import accepted
 from vcl_companion.mapping.tracks import PairMatches
 from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
 from vcl_companion.mapping.visibility import match_features
 from vcl_companion.vision.features import FeatureOptions
-from vcl_companion.vision.resection import NotFound
 
 # Keyframes that a view is matched with before it is given up.
 _TRIED = 6
@@ -83,8 +83,11 @@ def extended(
         sure = map_uncertainty(old)
     except ValueError as error:
         return NoMap(str(error))
-    update = _Update(old, sure, views, KeyframeLibrary(old, features_of), options)
-    growth = update.run()
+    update = _Update(old, sure, views, KeyframeLibrary(old, features_of), options, seed)
+    try:
+        growth = update.run()
+    except ValueError as error:  # of map_uncertainty: with the new views it is not fixed
+        return NoMap(str(error))
     if isinstance(growth, NoMap):
         return growth
     reason = broken_continuity(old, sure, growth)
@@ -104,27 +107,33 @@ class _Update:
         views: list[DroneView],
         library: KeyframeLibrary,
         options: MapOptions,
+        seed: int,
     ) -> None:
         self._old, self._sure, self._views = old, sure, views
-        self._library, self._options = library, options
+        self._library, self._options, self._seed = library, options, seed
         self._pairs = Pairs({}, {})
         self._joined: dict[int, Joined] = {}
         self._reasons: dict[int, str] = {}
+        self._refuted: set[int] = set()
+        self._grouped: set[int] = set()
 
     def run(self) -> Growth | NoMap:
         """Register view after view until no more can be; drop those that the whole refutes."""
         for i in range(len(self._views)):
             self._join_old(i)
         growth: Growth | None = None
-        while self._joined:
-            self._match_joined()
-            growth = grown(
-                self._old, self._library, self._views, self._joined, self._pairs, self._options
-            )
-            if self._drop_unsupported(growth):
-                growth = None
-                continue
-            if not self._join_new(growth):
+        while True:
+            if self._joined:
+                self._match_joined()
+                growth = grown(
+                    self._old, self._library, self._views, self._joined, self._pairs, self._options
+                )
+                if self._drop_unsupported(growth):
+                    growth = None
+                    continue
+                if self._join_new(growth):
+                    continue
+            if not self._join_groups(growth):
                 break
         if growth is None:
             return NoMap("no new view fits the map: " + "; ".join(self._told()))
@@ -188,6 +197,9 @@ class _Update:
             for k in np.argsort(overlap)[::-1][:_PARTNERS]:
                 if overlap[k] > 0.0:
                     self._match_keyframe(int(k), i)
+        self._match_views()
+
+    def _match_views(self) -> None:
         for i, k in self._view_pairs():
             if (i, k) not in self._pairs.with_views:
                 self._pairs.with_views[i, k] = match_features(
@@ -224,58 +236,92 @@ class _Update:
             inside = (pixels > 0) & (pixels < (camera.width_px, camera.height_px))
         return np.asarray(inside.all(axis=1))
 
+    def _waiting(self) -> list[int]:
+        return [
+            i for i in range(len(self._views)) if i not in self._joined and i not in self._refuted
+        ]
+
     def _join_new(self, growth: Growth) -> bool:
         """Register waiting views by landmarks that came with others; whether any was."""
-        waiting = [i for i in range(len(self._views)) if i not in self._joined]
-        if not waiting:
-            return False
-        try:
-            sure = map_uncertainty(growth.landmark_map)
-        except ValueError:
-            return False
-        some = False
-        for i in waiting:
-            links = self._links(growth, i)
-            found = join(self._views[i], links, growth.landmark_map, sure, self._options)
-            if isinstance(found, NotFound):
-                self._reasons[i] = found.reason
-                continue
-            old = growth.old[found.links.a]
-            self._joined[i] = Joined(
-                found.world_from_body, PairMatches(old[old >= 0], found.links.b[old >= 0])
-            )
-            some = True
-        if some:
-            self._take(growth)
-        return some
+        known, sure = self._known(growth)
+        found = {}
+        for i in self._waiting():
+            one = join(self._views[i], self._links(growth, i), known, sure, self._options)
+            if isinstance(one, Joined):
+                found[i] = one
+            else:
+                self._reasons[i] = one.reason
+        self._take(growth, found)
+        return bool(found)
 
-    def _links(self, growth: Growth, i: int) -> PairMatches:
+    def _join_groups(self, growth: Growth | None) -> bool:
+        """Register waiting views of one drone jointly, each drone once; whether any was."""
+        waiting = self._waiting()
+        for drone_id in sorted({self._views[i].drone_id for i in waiting} - self._grouped):
+            group = [i for i in waiting if self._views[i].drone_id == drone_id]
+            self._grouped.add(drone_id)
+            if len(group) < 2:
+                continue
+            self._match_views()
+            known, sure = self._known(growth)
+            found = join_together(
+                [self._views[i] for i in group],
+                [self._links(growth, i) for i in group],
+                {
+                    (group.index(i), group.index(k)): m
+                    for (i, k), m in self._pairs.with_views.items()
+                    if i in group and k in group
+                },
+                known,
+                sure,
+                self._options,
+                self._seed,
+            )
+            if isinstance(found, NoMap):
+                self._reasons |= dict.fromkeys(group, found.reason)
+                continue
+            self._take(growth, {group[n]: one for n, one in found.items()})
+            return True
+        return False
+
+    def _known(self, growth: Growth | None) -> tuple[LandmarkMap, MapUncertainty]:
+        """Return the map so far and how well it is known."""
+        if growth is None:
+            return self._old, self._sure
+        return growth.landmark_map, map_uncertainty(growth.landmark_map)
+
+    def _links(self, growth: Growth | None, i: int) -> PairMatches:
         """Return the landmarks that a waiting view's matches with all others lead to."""
-        landmarks, features = [], []
-        place = np.full(len(self._old.points_world), -1, dtype=np.intp)
-        place[growth.old[growth.old >= 0]] = np.flatnonzero(growth.old >= 0)
+        none = np.zeros(0, np.intp)
+        landmarks, features = [none], [none]
+        # Of the old map's landmarks to those of the map so far.
+        place = np.arange(len(self._old.points_world))
+        if growth is not None:
+            place = np.full(len(place), -1, dtype=np.intp)
+            place[growth.old[growth.old >= 0]] = np.flatnonzero(growth.old >= 0)
         for (k, mine), matches in self._pairs.with_keyframes.items():
             if mine == i:
                 old = self._library.of(k).landmark[matches.a]
-                row = np.where(old >= 0, place[old], -1)
-                landmarks.append(row[row >= 0])
-                features.append(matches.b[row >= 0])
+                landmarks.append(np.where(old >= 0, place[old], -1))
+                features.append(matches.b)
         for (a, b), matches in self._pairs.with_views.items():
             for other, mine, of_other, of_mine in (
                 (a, b, matches.a, matches.b),
                 (b, a, matches.b, matches.a),
             ):
-                if mine == i and other in growth.rows:
-                    row = growth.rows[other][of_other]
-                    landmarks.append(row[row >= 0])
-                    features.append(of_mine[row >= 0])
-        none = np.zeros(0, np.intp)
-        return _unique(
-            PairMatches(np.concatenate([none, *landmarks]), np.concatenate([none, *features]))
-        )
+                if growth is not None and mine == i and other in growth.rows:
+                    landmarks.append(growth.rows[other][of_other])
+                    features.append(of_mine)
+        links = PairMatches(np.concatenate(landmarks), np.concatenate(features))
+        return _unique(PairMatches(links.a[links.a >= 0], links.b[links.a >= 0]))
 
-    def _take(self, growth: Growth) -> None:
-        """Go on from adjusted poses and landmarks."""
+    def _take(self, growth: Growth | None, found: dict[int, Joined]) -> None:
+        """Go on from adjusted poses and landmarks, with views registered on them."""
+        if not found:
+            return
+        if growth is None:
+            self._joined |= found
+            return
         n = len(self._old.keyframes)
         keyframes = growth.landmark_map.keyframes
         points = self._old.points_world.copy()
@@ -284,6 +330,11 @@ class _Update:
         self._old = replace(self._old, keyframes=keyframes[:n], points_world=points)
         for i, keyframe in zip(growth.views, keyframes[n:], strict=True):
             self._joined[i] = replace(self._joined[i], world_from_body=keyframe.world_from_body)
+        for i, one in found.items():
+            # Links to new landmarks come again with the matches that led to them.
+            old = growth.old[one.links.a]
+            links = PairMatches(old[old >= 0], one.links.b[old >= 0])
+            self._joined[i] = Joined(one.world_from_body, links)
 
     def _drop_unsupported(self, growth: Growth) -> bool:
         """Leave out views that hardly anything is left to see of; whether any was."""
@@ -294,6 +345,7 @@ class _Update:
             if n_seen < _MIN_SEEN:
                 self._reasons[i] = f"{n_seen} landmarks agree, {_MIN_SEEN} needed"
                 del self._joined[i]
+                self._refuted.add(i)
                 some = True
         return some
 

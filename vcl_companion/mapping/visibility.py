@@ -26,13 +26,25 @@ class Edge:
 
 
 def visibility_graph(
-    drones: list[DroneView], options: MapOptions, seed: int
+    drones: list[DroneView],
+    options: MapOptions,
+    seed: int,
+    matched: dict[tuple[int, int], PairMatches] | None = None,
 ) -> dict[tuple[int, int], Edge]:
-    """Match every pair of images and keep what one relative pose explains."""
-    return {
-        (i, k): _edge(drones[i], drones[k], options, seed)
-        for i, k in combinations(range(len(drones)), 2)
-    }
+    """Match every pair of images and keep what one relative pose explains.
+
+    Args:
+        drones: the views.
+        options: thresholds.
+        seed: of the robust searches.
+        matched: pairs that are matched already; then only those are looked at.
+    """
+    if matched is None:
+        matched = {
+            (i, k): match_features(drones[i].features, drones[k].features)
+            for i, k in combinations(range(len(drones)), 2)
+        }
+    return {(i, k): _edge(drones[i], drones[k], m, options, seed) for (i, k), m in matched.items()}
 
 
 def choose_hypothesis(
@@ -76,9 +88,8 @@ def _degrees_apart(one: Pose, other: Pose) -> tuple[float, float]:
     return float(np.rad2deg(turn)), float(np.rad2deg(np.arccos(cosine)))
 
 
-def _edge(a: DroneView, b: DroneView, options: MapOptions, seed: int) -> Edge:
+def _edge(a: DroneView, b: DroneView, matches: PairMatches, options: MapOptions, seed: int) -> Edge:
     """Find the relative pose of two drones' cameras, or say why not."""
-    matches = match_features(a.features, b.features)
     names = f"drones {a.drone_id} and {b.drone_id}"
     guess = None
     if a.ned_from_body is not None and b.ned_from_body is not None:
