@@ -10,13 +10,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.continuity import broken_continuity, pruned
+from vcl_companion.mapping.correspondences import Correspondences, unique
 from vcl_companion.mapping.drone_view import DroneView
-from vcl_companion.mapping.growth import Growth, Pairs, grown
+from vcl_companion.mapping.growth import Growth, grown
 from vcl_companion.mapping.joining import Joined, join, join_nearby
 from vcl_companion.mapping.known_features import FeaturesOf, KeyframeLibrary, detected
 from vcl_companion.mapping.landmark_map import LandmarkMap
@@ -25,17 +23,12 @@ from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.reconstruction import accepted
 from vcl_companion.mapping.tracks import PairMatches
 from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
-from vcl_companion.mapping.visibility import match_features
 from vcl_companion.vision.features import FeatureOptions
 
 # Keyframes that a view is matched with before it is given up.
 _TRIED = 6
-# A registered view is matched with this many keyframes that overlap it most.
-_PARTNERS = 2
-# Overlap counts fully from this angle between two rays on, and hardly where they are parallel.
-_WIDE_RAD = np.deg2rad(5.0)
+# A new view has to see this many landmarks in the end.
 _MIN_SEEN = 20
-_DEG_PER_PLACE = 15.0
 
 
 def extend_map(
@@ -84,10 +77,7 @@ def extended(
     except ValueError as error:
         return NoMap(str(error))
     update = _Update(old, sure, views, KeyframeLibrary(old, features_of), options, seed)
-    try:
-        growth = update.run()
-    except ValueError as error:  # of map_uncertainty: with the new views it is not fixed
-        return NoMap(str(error))
+    growth = update.run()
     if isinstance(growth, NoMap):
         return growth
     reason = broken_continuity(old, sure, growth)
@@ -111,7 +101,7 @@ class _Update:
     ) -> None:
         self._old, self._sure, self._views = old, sure, views
         self._library, self._options, self._seed = library, options, seed
-        self._pairs = Pairs({}, {})
+        self._matches = Correspondences(library, views)
         self._joined: dict[int, Joined] = {}
         self._reasons: dict[int, str] = {}
         self._refuted: set[int] = set()
@@ -124,16 +114,30 @@ class _Update:
         growth: Growth | None = None
         while True:
             if self._joined:
-                self._match_joined()
+                self._matches.match_joined(self._old, self._joined)
                 growth = grown(
-                    self._old, self._library, self._views, self._joined, self._pairs, self._options
+                    self._old,
+                    self._library,
+                    self._views,
+                    self._joined,
+                    self._matches.pairs,
+                    self._options,
                 )
                 if self._drop_unsupported(growth):
                     growth = None
                     continue
-                if self._join_new(growth):
-                    continue
-            if not self._join_groups(growth):
+            if not self._waiting():
+                break
+            known, sure = self._old, self._sure
+            if growth is not None:
+                known = growth.landmark_map
+                try:
+                    sure = map_uncertainty(known)
+                except ValueError as error:
+                    return NoMap(str(error))
+            if growth is not None and self._join_new(growth, known, sure):
+                continue
+            if not self._join_groups(growth, known, sure):
                 break
         if growth is None:
             return NoMap("no new view fits the map: " + "; ".join(self._told()))
@@ -145,15 +149,15 @@ class _Update:
     def _join_old(self, i: int) -> None:
         """Register a view by landmarks of the old map."""
         view, links = self._views[i], PairMatches(np.zeros(0, np.intp), np.zeros(0, np.intp))
-        for k in self._likely(view)[:_TRIED]:
-            matches = self._match_keyframe(k, i)
+        for k in self._matches.likely(self._old, view)[:_TRIED]:
+            matches = self._matches.with_keyframe(k, i)
             landmark = self._library.of(k).landmark[matches.a]
             of_map = landmark >= 0
             links = PairMatches(
                 np.concatenate([links.a, landmark[of_map]]),
                 np.concatenate([links.b, matches.b[of_map]]),
             )
-            found = join(view, _unique(links), self._old, self._sure, self._options)
+            found = join(view, unique(links), self._old, self._sure, self._options)
             if isinstance(found, Joined):
                 found = join_nearby(
                     view, found.world_from_body, self._library, self._old, self._sure, self._options
@@ -163,90 +167,19 @@ class _Update:
                 return
             self._reasons[i] = found.reason
 
-    def _likely(self, view: DroneView) -> list[int]:
-        """Return keyframes, newest first, those first that look where the view looks."""
-        keyframes = self._old.keyframes
-        places = []
-        for k, keyframe in enumerate(keyframes):
-            place = float(len(keyframes) - k) + (keyframe.drone_id != view.drone_id)
-            if view.ned_from_body is not None:
-                axis = (view.ned_from_body @ view.body_from_cam.rotation)[:, 2]
-                then = (keyframe.world_from_body.rotation @ keyframe.body_from_cam.rotation)[:, 2]
-                angle_deg = np.rad2deg(np.arccos(np.clip(axis @ then, -1.0, 1.0)))
-                place += float(angle_deg) / _DEG_PER_PLACE
-            places.append(place)
-        return [int(k) for k in np.argsort(places, kind="stable")]
-
-    def _match_keyframe(self, k: int, i: int) -> PairMatches:
-        if (k, i) not in self._pairs.with_keyframes:
-            self._pairs.with_keyframes[k, i] = match_features(
-                self._library.of(k).features, self._views[i].features
-            )
-        return self._pairs.with_keyframes[k, i]
-
-    def _match_joined(self) -> None:
-        """Match views with the keyframes that overlap them most, and with each other."""
-        origins = [k.world_from_body @ k.body_from_cam for k in self._old.keyframes]
-        for i, joined in self._joined.items():
-            cam = joined.world_from_body @ self._views[i].body_from_cam
-            visible = self._visible(i, cam)
-            overlap = [
-                _overlap(self._old.points_world[visible & self._old.seen[:, k]], cam, origin)
-                for k, origin in enumerate(origins)
-            ]
-            for k in np.argsort(overlap)[::-1][:_PARTNERS]:
-                if overlap[k] > 0.0:
-                    self._match_keyframe(int(k), i)
-        self._match_views()
-
-    def _match_views(self) -> None:
-        for i, k in self._view_pairs():
-            if (i, k) not in self._pairs.with_views:
-                self._pairs.with_views[i, k] = match_features(
-                    self._views[i].features, self._views[k].features
-                )
-
-    def _view_pairs(self) -> list[tuple[int, int]]:
-        """Return which new views are matched: neighbours in time of one drone, and the joined."""
-        pairs = set()
-        for i, view in enumerate(self._views):
-            mine = [k for k, v in enumerate(self._views) if v.drone_id == view.drone_id]
-            later = sorted(mine, key=lambda k: self._views[k].captured_at_ns)
-            at = later.index(i)
-            pairs |= {(min(i, k), max(i, k)) for k in later[at + 1 : at + 1 + _PARTNERS]}
-        cams = {
-            i: j.world_from_body @ self._views[i].body_from_cam for i, j in self._joined.items()
-        }
-        visible = {i: self._visible(i, cam) for i, cam in cams.items()}
-        for i in cams:
-            overlap = {
-                k: _overlap(self._old.points_world[visible[i] & visible[k]], cams[i], cams[k])
-                for k in cams
-                if k != i
-            }
-            best = sorted(overlap, key=lambda k: -overlap[k])[:_PARTNERS]
-            pairs |= {(min(i, k), max(i, k)) for k in best}
-        return sorted(pairs)
-
-    def _visible(self, i: int, world_from_cam: Pose) -> NDArray[np.bool_]:
-        """Return (N,) old landmarks that lie within a view."""
-        camera = self._views[i].camera
-        pixels = camera.project(world_from_cam.inverse().apply(self._old.points_world))
-        with np.errstate(invalid="ignore"):
-            inside = (pixels > 0) & (pixels < (camera.width_px, camera.height_px))
-        return np.asarray(inside.all(axis=1))
-
     def _waiting(self) -> list[int]:
         return [
             i for i in range(len(self._views)) if i not in self._joined and i not in self._refuted
         ]
 
-    def _join_new(self, growth: Growth) -> bool:
+    def _join_new(self, growth: Growth, known: LandmarkMap, sure: MapUncertainty) -> bool:
         """Register waiting views by landmarks that came with others; whether any was."""
-        known, sure = self._known(growth)
+        n_old = len(self._old.points_world)
         found = {}
         for i in self._waiting():
-            one = join(self._views[i], self._links(growth, i), known, sure, self._options)
+            one = join(
+                self._views[i], self._matches.links(n_old, growth, i), known, sure, self._options
+            )
             if isinstance(one, Joined):
                 found[i] = one
             else:
@@ -254,7 +187,7 @@ class _Update:
         self._take(growth, found)
         return bool(found)
 
-    def _join_groups(self, growth: Growth | None) -> bool:
+    def _join_groups(self, growth: Growth | None, known: LandmarkMap, sure: MapUncertainty) -> bool:
         """Register waiting views of one drone jointly, each drone once; whether any was."""
         waiting = self._waiting()
         for drone_id in sorted({self._views[i].drone_id for i in waiting} - self._grouped):
@@ -262,14 +195,14 @@ class _Update:
             self._grouped.add(drone_id)
             if len(group) < 2:
                 continue
-            self._match_views()
-            known, sure = self._known(growth)
+            self._matches.match_views(self._old, self._joined)
+            n_old = len(self._old.points_world)
             found = join_together(
                 [self._views[i] for i in group],
-                [self._links(growth, i) for i in group],
+                [self._matches.links(n_old, growth, i) for i in group],
                 {
                     (group.index(i), group.index(k)): m
-                    for (i, k), m in self._pairs.with_views.items()
+                    for (i, k), m in self._matches.pairs.with_views.items()
                     if i in group and k in group
                 },
                 known,
@@ -283,37 +216,6 @@ class _Update:
             self._take(growth, {group[n]: one for n, one in found.items()})
             return True
         return False
-
-    def _known(self, growth: Growth | None) -> tuple[LandmarkMap, MapUncertainty]:
-        """Return the map so far and how well it is known."""
-        if growth is None:
-            return self._old, self._sure
-        return growth.landmark_map, map_uncertainty(growth.landmark_map)
-
-    def _links(self, growth: Growth | None, i: int) -> PairMatches:
-        """Return the landmarks that a waiting view's matches with all others lead to."""
-        none = np.zeros(0, np.intp)
-        landmarks, features = [none], [none]
-        # Of the old map's landmarks to those of the map so far.
-        place = np.arange(len(self._old.points_world))
-        if growth is not None:
-            place = np.full(len(place), -1, dtype=np.intp)
-            place[growth.old[growth.old >= 0]] = np.flatnonzero(growth.old >= 0)
-        for (k, mine), matches in self._pairs.with_keyframes.items():
-            if mine == i:
-                old = self._library.of(k).landmark[matches.a]
-                landmarks.append(np.where(old >= 0, place[old], -1))
-                features.append(matches.b)
-        for (a, b), matches in self._pairs.with_views.items():
-            for other, mine, of_other, of_mine in (
-                (a, b, matches.a, matches.b),
-                (b, a, matches.b, matches.a),
-            ):
-                if growth is not None and mine == i and other in growth.rows:
-                    landmarks.append(growth.rows[other][of_other])
-                    features.append(of_mine)
-        links = PairMatches(np.concatenate(landmarks), np.concatenate(features))
-        return _unique(PairMatches(links.a[links.a >= 0], links.b[links.a >= 0]))
 
     def _take(self, growth: Growth | None, found: dict[int, Joined]) -> None:
         """Go on from adjusted poses and landmarks, with views registered on them."""
@@ -348,17 +250,3 @@ class _Update:
                 self._refuted.add(i)
                 some = True
         return some
-
-
-def _unique(links: PairMatches) -> PairMatches:
-    pairs = np.unique(np.stack([links.a, links.b], axis=1), axis=0)
-    return PairMatches(pairs[:, 0], pairs[:, 1])
-
-
-def _overlap(points: Array, one: Pose, other: Pose) -> float:
-    """Return how many points two cameras share, counted by the angle they are seen under."""
-    a, b = points - one.translation, points - other.translation
-    lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    cosine = np.einsum("ni,ni->n", a, b) / np.maximum(lengths, 1e-9)
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-    return float(np.minimum(angle / _WIDE_RAD, 1.0).sum())
