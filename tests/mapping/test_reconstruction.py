@@ -161,6 +161,26 @@ def test_several_known_distances_are_better_than_one() -> None:
     assert sigma[1] < 0.95 * sigma[0]
 
 
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_known_distances_that_contradict_each_other_are_refused(factor: float) -> None:
+    rng = np.random.default_rng(4)
+    scene = facade_scene(rng, n_views=3, noise_px=0.5, relief_m=4.0)
+    views = drone_views(rng, scene, [1, 2, 3], attitude_sigma_rad=0.02)
+    one, other = scene.baseline_m(0, 1), scene.baseline_m(0, 2)
+    reason = refusal(views, 1, [(1, 2, one), (1, 3, factor * other)])
+    assert "the known distances contradict each other" in reason
+    assert "drones 1 and 2" in reason
+    assert "drones 1 and 3" in reason or "between drones 3 and 1" in reason
+
+
+@pytest.mark.parametrize("pair", [(1, 1, 2.0), (1, 2, 0.0), (1, 2, -2.0), (1, 2, float("nan"))])
+def test_a_known_distance_that_is_none_is_refused(pair: tuple[int, int, float]) -> None:
+    rng = np.random.default_rng(4)
+    scene = facade_scene(rng, 100, noise_px=0.3)
+    views = drone_views(rng, scene, [1, 2])
+    assert refusal(views, 1, [(1, 2, scene.baseline_m(0, 1)), pair]).endswith("is none")
+
+
 def test_a_known_distance_to_a_stranger_is_ignored() -> None:
     rng = np.random.default_rng(4)
     scene = facade_scene(rng, noise_px=0.3)
