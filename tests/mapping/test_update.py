@@ -9,19 +9,22 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.checks import assert_pose_close
+from tests.mapping.rendered import panels, rendered_view
 from tests.mapping.views import descriptors_of, drone_views, world_from_scene
 from tests.scenes import PINHOLE, Scene, observe
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, matrix_from_euler
+from vcl_companion.mapping.continuity import MAX_IMAGE_BYTES
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.reconstruction import reconstruct
 from vcl_companion.mapping.uncertainty import map_uncertainty
-from vcl_companion.mapping.update import extended
+from vcl_companion.mapping.update import extend_map, extended
 from vcl_companion.recording.sensor import BODY_FROM_CAM_FORWARD
-from vcl_companion.vision.features import Features
-from vcl_companion.wire.map_codec import decode_map, encode_map
+from vcl_companion.vision.features import Detector, Features
+from vcl_companion.wire.header import MAX_BLOB_BYTES
+from vcl_companion.wire.map_codec import MAX_CELLS, MAX_KEYFRAMES, decode_map, encode_map
 
 OPTIONS = MapOptions(detectors=("akaze",))
 MOUNTING = Pose(BODY_FROM_CAM_FORWARD, np.array([0.1, 0.0, 0.05]))
@@ -318,3 +321,37 @@ def test_the_update_of_a_seed_is_one_update() -> None:
     one, other = (grown(old, views, views[3:]) for _ in range(2))
     np.testing.assert_array_equal(one.points_world, other.points_world)
     np.testing.assert_array_equal(one.observed_px, other.observed_px)
+
+
+@pytest.mark.parametrize("detectors", [("akaze", "sift"), ("orb",)])
+def test_rendered_views_extend_a_map_whatever_it_is_made_of(
+    detectors: tuple[Detector, ...],
+) -> None:
+    """Descriptors of old landmarks come from the keyframe images, whichever detector is set."""
+    options = MapOptions(detectors=detectors)
+    scene = panels(np.random.default_rng(13))
+    bodies = [at(0.0, 0.0), at(0.2, 1.5, -0.3), at(-1.0, 3.0, 0.2), at(-0.8, 4.5, -0.2)]
+    views = [
+        rendered_view(scene, 1 + k % 2, k // 2, body, MOUNTING, options)
+        for k, body in enumerate(bodies)
+    ]
+    known = float(np.linalg.norm(bodies[0].translation - bodies[1].translation))
+    old = reconstruct(views[:2], 1, [(1, 2, known)], options)
+    assert isinstance(old, LandmarkMap), old
+    old = decode_map(encode_map(old))
+    found = extend_map(old, PARENT, views[2:], options)
+    assert isinstance(found, LandmarkMap), found
+    assert found.detectors == detectors
+    assert len(found.points_world) > 1.2 * len(old.points_world)
+    for keyframe, body in zip(found.keyframes, bodies, strict=True):
+        assert_pose_close(keyframe.world_from_body, body, within_m=0.1, within_rad=0.01)
+    data = encode_map(found)
+    assert encode_map(decode_map(data)) == data
+
+
+def test_an_encoded_map_of_the_largest_size_passes_as_one_blob() -> None:
+    """Pixels of 16 000 landmarks take two bytes and a bit each way, in four images on average."""
+    table = 16_000 * (3 * 5 + 4 * 2 * 3) + 64 * 16_000 // 8
+    assert MAX_IMAGE_BYTES + table < MAX_BLOB_BYTES
+    assert MAX_CELLS >= 16_000 * 64
+    assert MapOptions.max_keyframes <= MAX_KEYFRAMES
