@@ -23,6 +23,7 @@ from sitl.result import Event, gather
 from sitl.swarm import Swarm
 from sitl.trajectory_files import write_trajectories
 from vcl_companion.recording import read_recording
+from vcl_companion.vision.warm_up import warm_up
 
 _ANSWER_TIMEOUT_S = 60.0
 
@@ -58,6 +59,9 @@ def fly(recording_path: Path, out: Path, options: FlyOptions, progress: Progress
     progress("reading the recording", 0, 0)
     plan = plan_flight(read_recording(recording_path), options)
     prepare_folder(out, plan)
+    # Daemons that start together would all compile the same.
+    progress("compiling, once on this machine", 0, 0)
+    warm_up()
     conduct = asyncio.run(_flown(plan, out, progress))
     progress("writing the report", 0, 0)
     result = gather(plan, out, conduct.events)

@@ -435,7 +435,6 @@ def test_a_feature_where_the_lens_model_has_no_inverse_is_left_out(
 @pytest.mark.parametrize(
     "name",
     [
-        "threshold_px",
         "guided_radius_px",
         "noise_floor_px",
         "bias_px_per_deg",

@@ -66,6 +66,8 @@ def test_the_unit_is_what_the_daemon_expects() -> None:
     assert said["ExecStart"] == f"{PROGRAM} run --config /etc/vcl-companion/%i.toml"
     expected = {"Type": "notify", "User": "vcl", "Restart": "on-failure", "WatchdogSec": "10s"}
     assert expected.items() <= said.items()
+    # Without a home, numba keeps what it compiles only where it is told to.
+    assert f"NUMBA_CACHE_DIR=%C/{said['CacheDirectory']}/" in said["Environment"]
 
 
 def test_sysusers_makes_the_user(tmp_path: Path) -> None:

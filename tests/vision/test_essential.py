@@ -16,7 +16,7 @@ from vcl_companion.vision.essential import (
 )
 
 OPTIONS = EssentialOptions()
-QUICK = EssentialOptions(n_seeds=1)
+QUICK = EssentialOptions(max_samples=2000)
 
 
 def matches_of(scene: Scene) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -164,8 +164,8 @@ def test_both_planar_twins_are_returned(noise_px: float) -> None:
             assert near[0].inliers.mean() > 0.95
 
 
-def test_homography_and_known_rotation_are_start_enough() -> None:
-    blind = EssentialOptions(n_seeds=0)  # only the homography and the guess remain
+def test_a_known_rotation_is_start_enough() -> None:
+    blind = EssentialOptions(max_samples=1)  # what the search finds by then is luck
     for seed in range(6):
         rng = np.random.default_rng(seed)
         scene = facade_scene(

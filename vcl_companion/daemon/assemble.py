@@ -30,6 +30,7 @@ from vcl_companion.links.peers import PeerLink
 from vcl_companion.recording.sensor import read_sensor
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.transfer import Transfers
+from vcl_companion.vision.warm_up import warm_up
 
 _log = logging.getLogger(__name__)
 
@@ -85,6 +86,14 @@ async def _run(config: Config) -> int:
     # Frames never wait for a map that is being built: one thread for each.
     vision = ThreadPoolExecutor(1, "vision")
     mapping = ThreadPoolExecutor(1, "mapping")
+    # Before anybody is told that we are here: no frame has to wait for the compiler.
+    notify.status("compiling, once on this machine")
+    warm = loop.run_in_executor(vision, warm_up)
+    stop = loop.create_task(ended.wait())
+    await asyncio.wait((warm, stop), return_when=asyncio.FIRST_COMPLETED)
+    stop.cancel()
+    if warm.done():
+        await warm
     rng = np.random.default_rng()
     exchange = Exchange(
         config.system_id,

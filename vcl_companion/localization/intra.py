@@ -32,7 +32,6 @@ class LocalizationOptions:
     Attributes:
         detector: features to look for; must be among those the maps are built with.
         min_inliers: landmarks that must agree on a pose.
-        threshold_px: reprojection error of an inlier in the search.
         guided_radius_px: largest uncertainty of a prediction that still guides the matching.
         noise_floor_px: pixel noise is never taken for smaller than this, 1 sigma.
         bias_px_per_deg: misplacement of a feature per degree that the landmark is
@@ -45,7 +44,6 @@ class LocalizationOptions:
 
     detector: Detector = "akaze"
     min_inliers: int = 15
-    threshold_px: float = 4.0
     guided_radius_px: float = 40.0
     noise_floor_px: float = 0.5
     bias_px_per_deg: float = 0.03
@@ -58,7 +56,6 @@ class LocalizationOptions:
         if self.min_inliers < 6:
             raise ValueError(f"min_inliers must be at least 6, got {self.min_inliers}")
         for name in (
-            "threshold_px",
             "guided_radius_px",
             "noise_floor_px",
             "max_sigma_m",
@@ -339,7 +336,7 @@ class _Matcher:
         return least
 
     def _resection_options(self) -> ResectionOptions:
-        return ResectionOptions(self.options.threshold_px, self.options.min_inliers)
+        return ResectionOptions(self.options.min_inliers)
 
     def _refined(
         self, start: Pose | NotFound, landmarks: NDArray[np.intp], sightings: Sightings

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, skew
+from vcl_companion.vision.acransac import AcRansacOptions
+from vcl_companion.vision.relative_pose import essential_candidates
 from vcl_companion.vision.triangulation import triangulate
 
 _MIN_MATCHES = 12
@@ -25,14 +26,12 @@ class EssentialOptions:
     """How relative poses are searched.
 
     Attributes:
-        threshold_px: epipolar distance of an inlier in the search.
         noise_px: 1-sigma of the epipolar (Sampson) distance in the cost.
-        n_seeds: independent searches; a planar scene needs several to show both twins.
+        max_samples: of each search (five-point and plane).
     """
 
-    threshold_px: float = 1.5
     noise_px: float = 0.5
-    n_seeds: int = 4
+    max_samples: int = 20000
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +75,10 @@ def relative_poses(
     if usable.sum() < _MIN_MATCHES:
         return []
     ideal_a, ideal_b = ideal_a[usable], ideal_b[usable]
-    starts = _essential_starts(ideal_a, ideal_b, focal_px, options, seed)
-    starts += _homography_starts(ideal_a, ideal_b, focal_px, options)
+    search = AcRansacOptions(max_samples=options.max_samples)
+    rng = np.random.default_rng(seed)
+    found_by_search = essential_candidates(ideal_a, ideal_b, focal_px, rng, search)
+    starts = [candidate.b_from_a for candidate in found_by_search]
     if rotation_guess is not None:
         starts.append(_translation_only(ideal_a, ideal_b, rotation_guess))
     found: list[RelativePose] = []
@@ -107,50 +108,6 @@ def sampson_px(b_from_a: Pose, ideal_a: Array, ideal_b: Array, focal_px: float) 
     lines_a = b @ essential
     slope = np.sqrt((lines_a[:, :2] ** 2).sum(axis=1) + (lines_b[:, :2] ** 2).sum(axis=1))
     return np.asarray(focal_px * np.einsum("ni,ni->n", b, lines_b) / np.maximum(slope, 1e-12))
-
-
-def _essential_starts(
-    a: Array, b: Array, focal_px: float, options: EssentialOptions, seed: int
-) -> list[Pose]:
-    starts: list[Pose] = []
-    for k in range(options.n_seeds):
-        params = cv2.UsacParams()
-        params.threshold = options.threshold_px / focal_px
-        params.confidence = 0.9999
-        params.maxIterations = 3000
-        params.randomGeneratorState = seed + 7919 * k
-        params.sampler = cv2.SAMPLING_UNIFORM
-        params.score = cv2.SCORE_METHOD_MAGSAC
-        params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
-        params.loIterations = 10
-        params.loSampleSize = 14
-        eye = np.eye(3)
-        no_distortion = np.zeros(4)
-        matrix, _ = cv2.findEssentialMat(a, b, eye, eye, no_distortion, no_distortion, params)
-        if matrix is None or matrix.shape[0] < 3:
-            continue
-        *rotations, translation = (
-            np.asarray(part, dtype=np.float64) for part in cv2.decomposeEssentialMat(matrix[:3])
-        )
-        for rotation in rotations:
-            starts += [Pose(rotation, sign * translation[:, 0]) for sign in (1.0, -1.0)]
-    return starts
-
-
-def _homography_starts(
-    a: Array, b: Array, focal_px: float, options: EssentialOptions
-) -> list[Pose]:
-    matrix, _ = cv2.findHomography(a, b, cv2.RANSAC, 2.0 * options.threshold_px / focal_px)
-    if matrix is None or not np.all(np.isfinite(matrix)):
-        return []
-    _, rotations, translations, _ = cv2.decomposeHomographyMat(matrix, np.eye(3))
-    starts = []
-    for rotation, column in zip(rotations, translations, strict=True):
-        translation = np.asarray(column, dtype=np.float64)[:, 0]
-        length = float(np.linalg.norm(translation))
-        if length > 1e-6 and np.linalg.det(rotation) > 0:
-            starts.append(Pose(np.asarray(rotation, dtype=np.float64), translation / length))
-    return starts
 
 
 def _translation_only(a: Array, b: Array, rotation: Array) -> Pose:

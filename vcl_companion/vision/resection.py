@@ -1,6 +1,6 @@
 """A camera's pose from landmarks it sees: robust search, refinement, covariance (IV-D, IV-F).
 
-The search is P3P inside RANSAC; the refinement weighs every landmark by the
+The search is P3P inside an a-contrario RANSAC; the refinement weighs every landmark by the
 pixel noise **and** by the landmark's own uncertainty as it appears in this
 image, so that a badly triangulated depth cannot pull the pose.
 """
@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.vision.absolute_pose import resect
+from vcl_companion.vision.acransac import AcRansacOptions
+from vcl_companion.vision.acransac import NotFound as NotFound
 from vcl_companion.vision.bundle import linearized
 from vcl_companion.vision.information import covariance_of
 
@@ -36,20 +38,16 @@ class ResectionOptions:
     """How a pose is searched and when it is believed.
 
     Attributes:
-        threshold_px: reprojection error of an inlier in the search.
         min_inliers: fewer are refused.
-        max_iterations: RANSAC samples at most.
+        max_samples: of the search, at most.
     """
 
-    threshold_px: float = 4.0
     min_inliers: int = 15
-    max_iterations: int = 2000
+    max_samples: int = 2000
 
     def __post_init__(self) -> None:
-        if self.threshold_px <= 0 or self.min_inliers < 6 or self.max_iterations < 10:
-            raise ValueError(
-                "resection needs threshold_px > 0, min_inliers >= 6, max_iterations >= 10"
-            )
+        if self.min_inliers < 6 or self.max_samples < 10:
+            raise ValueError("resection needs min_inliers >= 6, max_samples >= 10")
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,37 +110,22 @@ class Resection:
     rms_px: float
 
 
-@dataclass(frozen=True)
-class NotFound:
-    """No pose can be believed, and why."""
-
-    reason: str
-
-
-def search(sightings: Sightings, options: ResectionOptions) -> Pose | NotFound:
-    """Find a pose that many sightings agree on, without any first guess (P3P, RANSAC)."""
+def search(sightings: Sightings, options: ResectionOptions, seed: int = 0) -> Pose | NotFound:
+    """Find the pose that the sightings make most meaningful, without any first guess."""
     usable = sightings.usable()
     n = int(usable.sum())
     if n < options.min_inliers:
         return NotFound(f"{n} landmarks matched, {options.min_inliers} needed")
-    focal = sightings.focal_px
-    ok, rvec, tvec, inliers = cv2.solvePnPRansac(
+    found = resect(
+        sightings.ideal[usable],
         sightings.points[usable],
-        sightings.ideal[usable] * focal,
-        np.diag([focal, focal, 1.0]),
-        None,
-        iterationsCount=options.max_iterations,
-        reprojectionError=options.threshold_px,
-        confidence=0.9999,
-        flags=cv2.SOLVEPNP_AP3P,
+        sightings.focal_px,
+        np.random.default_rng(seed),
+        AcRansacOptions(options.max_samples),
     )
-    if not ok or inliers is None or not np.all(np.isfinite(rvec)) or not np.all(np.isfinite(tvec)):
+    if isinstance(found, NotFound):
         return NotFound(f"no pose agrees with {options.min_inliers} of {n} matched landmarks")
-    rotation, _ = cv2.Rodrigues(rvec)
-    cam_from_world = Pose(
-        np.asarray(rotation, dtype=np.float64), np.asarray(tvec, dtype=np.float64)[:, 0]
-    )
-    return (sightings.body_from_cam @ cam_from_world).inverse()
+    return (sightings.body_from_cam @ found.cam_from_world).inverse()
 
 
 def refine(
