@@ -392,7 +392,12 @@ def test_no_payload_whatever_raises(told: list[tuple[int, int, bytes]]) -> None:
             two = await members.start(2, runs=False)
             for sender, payload_type, payload in told:
                 two.exchange.on_tunnel(tunnel(sender, payload_type, payload))
-            assert set(two.exchange.refused) <= {"payload", "frame", "frame nobody asked for"}
+            assert set(two.exchange.refused) <= {
+                "payload",
+                "frame",
+                "frame nobody asked for",
+                "pose nobody asked for",
+            }
             assert sum(two.exchange.refused.values()) <= len(told)
 
     with tempfile.TemporaryDirectory() as directory:

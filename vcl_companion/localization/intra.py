@@ -23,6 +23,9 @@ from vcl_companion.vision.resection import (
 )
 
 _SURE_PX = 8.0
+# One landmark may decide this much of a pose that a prediction led to, and of one found without:
+# nothing else speaks for that one, and on few far landmarks it is metres off and sure of itself.
+_LED_LEVERAGE, _FOUND_LEVERAGE = 0.4, 0.25
 
 
 @dataclass(frozen=True)
@@ -177,13 +180,14 @@ def localize_intra(
     guided = False
     radius_px = float("inf") if prior is None else scene.radius_px(prior)
     if prior is not None and radius_px <= options.guided_radius_px:
-        attempt = scene.guided(prior.world_from_body, max(radius_px, _SURE_PX))
+        attempt = scene.guided(prior.world_from_body, max(radius_px, _SURE_PX), _LED_LEVERAGE)
         guided = isinstance(attempt.result, Resection)
     if attempt is None or not guided:
         attempt = scene.whole_map()
     # Matched from nearby already, a second round would find the same again.
     if isinstance(attempt.result, Resection) and not (guided and radius_px <= 2.0 * _SURE_PX):
-        again = scene.guided(attempt.result.world_from_body, _SURE_PX)
+        limit = _LED_LEVERAGE if guided else _FOUND_LEVERAGE
+        again = scene.guided(attempt.result.world_from_body, _SURE_PX, limit)
         if (
             isinstance(again.result, Resection)
             and again.result.inliers.sum() >= attempt.result.inliers.sum()
@@ -217,7 +221,7 @@ class _Matcher:
         sigma_rad = float(np.sqrt(np.linalg.eigvalsh(prior.covariance[3:, 3:])[-1]))
         return 3.0 * self.camera.focal_px * float(np.hypot(sigma_m / depth, sigma_rad))
 
-    def guided(self, world_from_body: Pose, radius_px: float) -> _Matched:
+    def guided(self, world_from_body: Pose, radius_px: float, max_leverage: float) -> _Matched:
         """Match near where the pose puts each landmark, then refine from that pose."""
         cam_from_world = (world_from_body @ self.body_from_cam).inverse()
         predicted = self.camera.project(cam_from_world.apply(self.index.landmark_map.points_world))
@@ -240,8 +244,8 @@ class _Matcher:
         sightings = self._sightings(found, landmarks, world_from_body)
         start: Pose | NotFound = world_from_body
         if radius_px > _SURE_PX:
-            start = search(sightings, self._resection_options())
-        return self._refined(start, landmarks, sightings)
+            start = search(sightings, self._resection_options(max_leverage))
+        return self._refined(start, landmarks, sightings, max_leverage)
 
     def whole_map(self) -> _Matched:
         """Match against every landmark, then search the pose among the matches."""
@@ -249,7 +253,8 @@ class _Matcher:
             self.features, self.index.entries, self.index.owner, MatchOptions()
         )
         sightings = self._sightings(found, landmarks, None)
-        return self._refined(search(sightings, self._resection_options()), landmarks, sightings)
+        start = search(sightings, self._resection_options(_FOUND_LEVERAGE))
+        return self._refined(start, landmarks, sightings, _FOUND_LEVERAGE)
 
     def judged(
         self, attempt: _Matched, guided: bool, ned_from_body: Array | None
@@ -342,13 +347,17 @@ class _Matcher:
             least = np.where(seen[:, i], np.minimum(least, bias), least)
         return least
 
-    def _resection_options(self) -> ResectionOptions:
-        return ResectionOptions(self.options.min_inliers)
+    def _resection_options(self, max_leverage: float) -> ResectionOptions:
+        return ResectionOptions(self.options.min_inliers, max_leverage=max_leverage)
 
     def _refined(
-        self, start: Pose | NotFound, landmarks: NDArray[np.intp], sightings: Sightings
+        self,
+        start: Pose | NotFound,
+        landmarks: NDArray[np.intp],
+        sightings: Sightings,
+        max_leverage: float,
     ) -> _Matched:
         if isinstance(start, NotFound):
             return _Matched(landmarks, sightings, start)
-        result = refine(start, sightings, self._resection_options())
+        result = refine(start, sightings, self._resection_options(max_leverage))
         return _Matched(landmarks, sightings, result)

@@ -24,7 +24,6 @@ Mask = NDArray[np.bool_]
 
 # 99 % of a two-dimensional Gaussian lies within this squared Mahalanobis distance.
 _CHI2_2_99 = 9.21
-_MAX_LEVERAGE = 0.25
 # Variance of the robust estimate over that of its weights taken as fixed, for Gaussian
 # noise in two dimensions: E[w^2 s/2] E[w]^2 / (E[w + s w']^2 E[w^2]) with w = (1 + s/4)^-2.
 _ROBUST_LOSS = 1.1136
@@ -40,10 +39,12 @@ class ResectionOptions:
     Attributes:
         min_inliers: fewer are refused.
         max_samples: of the search, at most.
+        max_leverage: how much of its most determined direction one landmark may decide.
     """
 
     min_inliers: int = 15
     max_samples: int = 2000
+    max_leverage: float = 0.4
 
     def __post_init__(self) -> None:
         if self.min_inliers < 6 or self.max_samples < 10:
@@ -154,7 +155,7 @@ def refine(
             return found
         # On a flat scene one landmark off the plane, a wrong match perhaps, would
         # fix the pose all by itself: the pose has to stand without such landmarks.
-        decisive = _leverage(found) > _MAX_LEVERAGE
+        decisive = _leverage(found) > options.max_leverage
         if not decisive.any():
             return found
         usable[np.flatnonzero(found.inliers)[decisive]] = False
