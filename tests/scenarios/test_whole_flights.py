@@ -43,7 +43,7 @@ def test_shared_recordings_fly_honestly(name: str, tmp_path: Path) -> None:
         pytest.skip("../shared/data is not here")
     report = flown(SHARED / name, tmp_path / "out")
     assert_accounted_and_honest(report)
-    assert report["map"]["revisions"] == 1
+    assert report["map"]["revisions"] >= 1
     # The drones of the known distance see the first map's scene from its own keyframes.
     for drone in ("mav0", "mav1"):
         assert report["drones"][drone]["frames_localized"] >= 1
