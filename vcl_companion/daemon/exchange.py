@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -21,11 +22,10 @@ from vcl_companion.clock import Clock
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.flight_log import FlightLog
-from vcl_companion.daemon.frame_answers import FrameAnswers, WantedFrame
+from vcl_companion.daemon.frame_answers import FrameAnswers
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.inter_host import InterHost
 from vcl_companion.daemon.inter_target import InterTarget
-from vcl_companion.daemon.mailbox import PeerMailbox
 from vcl_companion.daemon.map_rounds import MapRounds, RoundOptions
 from vcl_companion.daemon.map_sharing import MapSharing
 from vcl_companion.daemon.map_store import MapStore, StoredMap
@@ -119,9 +119,17 @@ class Exchange:
         self._refusals = Refusals(log)
         self._frames = FrameHistory()
         self._answers = FrameAnswers(
-            system_id, self._frames, autopilot, sensor, clock, executor,
+            system_id,
+            self._frames,
+            autopilot,
+            sensor,
+            clock,
+            log,
+            executor,
+            partial(self._hand, BlobKind.FRAME_ANSWER),
+            transfers.cancel,
             options.map.keyframe_quality,
-        )  # fmt: skip
+        )
         memory = FeatureMemory(options.features)
         self._rounds = MapRounds(
             group,
@@ -156,7 +164,7 @@ class Exchange:
             sensor,
             clock,
             executor,
-            self._request_pose,
+            partial(self._hand, BlobKind.POSE_REQUEST),
             transfers.cancel,
             options.inter,
             rng,
@@ -176,8 +184,6 @@ class Exchange:
         self._vote = OwnVote(options.update)
         self._wants_update = False
         self._wake = asyncio.Event()
-        self._wanted: PeerMailbox[WantedFrame] = PeerMailbox()
-        self._answering: dict[int, int] = {}
 
     @property
     def refused(self) -> Mapping[str, int]:
@@ -212,7 +218,7 @@ class Exchange:
         """Keep transfers, states and rounds going until cancelled; a failure in one ends all."""
         async with asyncio.TaskGroup() as parts:
             parts.create_task(self._rounds.run())
-            parts.create_task(self._answer_requests())
+            parts.create_task(self._answers.run())
             parts.create_task(self._sharing.run())
             parts.create_task(self._inter_host.run())
             parts.create_task(self._keep_going())
@@ -244,9 +250,8 @@ class Exchange:
                 if before is not None and before.revision and not message.revision:
                     self._sharing.forgot(peer)
                 self._note(self._group.map_state(peer, message, now_s))
-            case FrameRequest(request_id=request_id, frame_age_s=age_s):
-                at_ns = self._clock.now_ns() - round(age_s * 1e9)
-                self._wanted.put(peer, WantedFrame(request_id, at_ns))
+            case FrameRequest():
+                self._answers.want(peer, message)
             case MapRefused():
                 if peer == self._group.coordinator:
                     self._maps.refuse(message.reason)
@@ -280,24 +285,6 @@ class Exchange:
         if not self._rounds.take(peer, frame):
             self._refusals.count(peer, "frame nobody asked for")
 
-    async def _answer_requests(self) -> None:
-        """Send the frames that peers ask for, one after the other; silence when there is none."""
-        while True:
-            peer, wanted = await self._wanted.take()
-            try:
-                blob = await self._answers.blob_for(peer, wanted)
-            except ValueError as error:
-                self._log.event("no answer", f"to drone {peer}: {error}")
-                _log.warning("no frame for drone %d: %s", peer, error)
-                continue
-            if blob is None:
-                continue
-            sent_id = self._transfers.submit(peer, BlobKind.FRAME_ANSWER, blob, self._now_s())
-            if self._answering.get(peer, sent_id) != sent_id:
-                self._transfers.cancel(self._answering[peer])  # it wants another one by now
-            self._answering[peer] = sent_id
-            self._wake.set()
-
     async def _decide(
         self, built: LandmarkMap | NoMap, instead_of: StoredMap | None, request_id: int
     ) -> None:
@@ -323,9 +310,9 @@ class Exchange:
             _log.warning("no map: %s", reason)
         self._maps.refuse(reason)
 
-    def _request_pose(self, peer: int, blob: bytes) -> int:
+    def _hand(self, kind: BlobKind, peer: int, blob: bytes) -> int:
         self._wake.set()
-        return self._transfers.submit(peer, BlobKind.POSE_REQUEST, blob, self._now_s())
+        return self._transfers.submit(peer, kind, blob, self._now_s())
 
     def _voted(self, now_s: float) -> bool:
         """Look at what we see of the map; whether our vote for an update has changed."""

@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 import asyncio
+import logging
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
 from vcl_companion.daemon.companion import ATTITUDE_WAIT_S
+from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_history import FrameHistory
+from vcl_companion.daemon.mailbox import PeerMailbox
 from vcl_companion.geometry.rotation import quaternion_from_matrix
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.mapping.drone_view import encode_image
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.wire.frame_codec import FrameAnswer, encode_frame
+from vcl_companion.wire.messages import FrameRequest
+
+_log = logging.getLogger(__name__)
 
 # Only a coordinator asks; while the swarm does not agree who that is there may be two.
 _MAX_ASKERS = 4
 
 
 @dataclass(frozen=True)
-class WantedFrame:
+class _Wanted:
     """What a peer asked for, in our time."""
 
     request_id: int
@@ -37,7 +44,9 @@ class _Given:
 
 
 class FrameAnswers:
-    """Makes answers of our frames; the last one to a peer is kept for when it asks again.
+    """Answers peers' requests for our frames, one after the other; silent when there is none.
+
+    The last answer to a peer is kept for when it asks again.
 
     Args:
         system_id: this drone.
@@ -45,7 +54,10 @@ class FrameAnswers:
         autopilot: for the attitude that goes with a frame.
         sensor: of our camera.
         clock: time base of frames.
+        log: told of a frame that cannot be sent.
         executor: runs the encoding.
+        hand: sends an answer to a peer; returns the transfer's id.
+        cancel: ends a transfer, one that is over already too.
         keyframe_quality: of the images, 1 to 100.
     """
 
@@ -56,7 +68,10 @@ class FrameAnswers:
         autopilot: AutopilotLink,
         sensor: Sensor,
         clock: Clock,
+        log: FlightLog,
         executor: Executor,
+        hand: Callable[[int, bytes], int],
+        cancel: Callable[[int], None],
         keyframe_quality: int,
     ) -> None:
         self._system_id = system_id
@@ -64,11 +79,38 @@ class FrameAnswers:
         self._autopilot = autopilot
         self._sensor = sensor
         self._clock = clock
+        self._log = log
         self._executor = executor
+        self._hand = hand
+        self._cancel = cancel
         self._keyframe_quality = keyframe_quality
+        self._wanted: PeerMailbox[_Wanted] = PeerMailbox()
         self._given: dict[int, _Given] = {}
+        self._on_its_way: dict[int, int] = {}
 
-    async def blob_for(self, peer: int, wanted: WantedFrame) -> bytes | None:
+    def want(self, peer: int, request: FrameRequest) -> None:
+        """Take a peer's request; a newer one of the same peer replaces it."""
+        at_ns = self._clock.now_ns() - round(request.frame_age_s * 1e9)
+        self._wanted.put(peer, _Wanted(request.request_id, at_ns))
+
+    async def run(self) -> None:
+        """Answer until cancelled."""
+        while True:
+            peer, wanted = await self._wanted.take()
+            try:
+                blob = await self._blob_for(peer, wanted)
+            except ValueError as error:
+                self._log.event("no answer", f"to drone {peer}: {error}")
+                _log.warning("no frame for drone %d: %s", peer, error)
+                continue
+            if blob is None:
+                continue
+            sent_id = self._hand(peer, blob)
+            if self._on_its_way.get(peer, sent_id) != sent_id:
+                self._cancel(self._on_its_way[peer])  # it wants another one by now
+            self._on_its_way[peer] = sent_id
+
+    async def _blob_for(self, peer: int, wanted: _Wanted) -> bytes | None:
         """Return the encoded answer to a request, or None when there is no frame of that instant.
 
         Asked again, the very same bytes: an answer on its way is not begun anew.
