@@ -149,6 +149,30 @@ def test_attitude_chooses_between_planar_twins(rng: np.random.Generator) -> None
     assert np.linalg.norm(off[:3]) < 0.3
 
 
+def test_a_match_whose_word_nobody_checks_is_not_taken(rng: np.random.Generator) -> None:
+    """All but one match lie close together; that one lies far off, wrong along its line."""
+    scene = index_of_scene(rng, facade_scene(rng, 600, relief_m=1.0, n_views=3))
+    errors, covariances = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        here, there = (
+            seen_from(rng, scene[0].landmark_map, scene[1], pose, noise_px=0.3)
+            for pose in (HOST, TARGET)
+        )
+        x, y = there.pixels.T
+        alone = int(np.argmax(x))
+        kept = (np.abs(x - 200.0) < 60.0) & (np.abs(y - 240.0) < 90.0)
+        kept[alone] = True
+        pixels = there.pixels.copy()
+        pixels[alone, 0] -= 4.0
+        narrow = observer(scene, Features(pixels[kept], there.descriptors[kept]), None)
+        found = localize_inter(observer(scene, here, HOST), HOST, SURE, narrow, scene[0], OPTIONS)
+        assert isinstance(found, Proposal), found
+        errors.append(TARGET.local(found.world_from_body))
+        covariances.append(found.covariance)
+    assert np.max(nees(errors, np.array(covariances))) < 4.0
+
+
 def test_a_proposal_too_vague_is_not_made(rng: np.random.Generator, relief: Scene) -> None:
     found = proposed(rng, relief, noise_px=0.5, options=InterOptions(max_sigma_m=1e-3))
     assert isinstance(found, NoProposal)

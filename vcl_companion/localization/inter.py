@@ -206,6 +206,14 @@ def _placed(hypothesis: RelativePose, pair: PairEvidence) -> _Placed | NoProposa
         if again.same(chosen):
             break
         chosen = again
+    for _ in range(_MAX_ROUNDS):
+        checked = pair.undecisive(pose, chosen)
+        if checked.same(chosen):
+            break
+        chosen = checked
+        pose = pair.refined(pose, chosen)
+    else:
+        return NoProposal("single matches decide the pose: the others do not fix it")
     placed = _Placed(pose, pair.cost(pose), chosen)
     if placed.n_common < pair.options.min_common:
         return _too_few(placed.n_common, pair.options)

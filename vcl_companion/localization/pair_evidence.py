@@ -22,6 +22,8 @@ from vcl_companion.vision.features import Features
 from vcl_companion.vision.information import covariance_of
 
 _STEP = 1e-6
+# One match may decide this much of the pose.
+_MAX_LEVERAGE = 0.4
 # Smallest eigenvalue of a normal matrix, scaled to a diagonal of ones, that is no rounding.
 _SINGULAR = 1e-9
 # Normalised squares beyond these are no noise: 3 sigma, 99.9 % of chi^2 with 2 and with 3
@@ -182,22 +184,35 @@ class PairEvidence:
             inverse + through @ host_covariance @ through.T + shared @ keyframes @ shared.T
         )
 
+    def undecisive(self, pose: Pose, chosen: Agreement) -> Agreement:
+        """Return those that agree without the ones that nearly decide the pose alone.
+
+        Such a one agrees with whatever pose it leads to: nothing checks its word.
+        """
+        normal, _, _, _ = self._system(pose, chosen)
+        inverse = covariance_of(normal, _SINGULAR)
+        if inverse is None:
+            return chosen
+        sigma_px = self._sigma_px(pose)
+        _, by_pose, weight = self._lines(pose, chosen.epipolar, sigma_px)
+        on_line = np.einsum("ni,ij,nj->n", by_pose, inverse, by_pose) * weight
+        residual, information, j_pose, _ = self._sightings(pose, chosen.landmark, sigma_px)
+        squared = np.einsum("nk,nkl,nl->n", residual, information, residual)
+        in_place = np.einsum("nki,ij,nlj,nkl->n", j_pose, inverse, j_pose, information)
+        epipolar, landmark = chosen.epipolar.copy(), chosen.landmark.copy()
+        epipolar[epipolar] = on_line <= _MAX_LEVERAGE
+        landmark[landmark] = in_place * _weight(squared) <= _MAX_LEVERAGE
+        return Agreement(epipolar, landmark)
+
     def _system(self, pose: Pose, chosen: Agreement) -> tuple[Array, Array, Array, Array]:
         """Return normal matrix, right side, its slopes by host (6, 6) and keyframes (6, 6V)."""
         sigma_px = self._sigma_px(pose)
         normal, rhs, lever = self._by_landmarks(pose, chosen.landmark, sigma_px)
-        error = self._epipolar_px(pose, chosen.epipolar)
-        by_pose, by_host = np.empty((len(error), 6)), np.empty((len(error), 6))
-        for k in range(6):
-            nudge = np.zeros(6)
-            nudge[k] = _STEP
-            moved = self._epipolar_px(pose.retracted(nudge), chosen.epipolar)
-            by_pose[:, k] = moved - error
+        error, by_pose, weight = self._lines(pose, chosen.epipolar, sigma_px)
+        by_host = np.empty((len(error), 6))
+        for k, nudge in enumerate(_STEP * np.eye(6)):
             moved = self._epipolar_px(pose, chosen.epipolar, self.host_pose.retracted(nudge))
-            by_host[:, k] = moved - error
-        by_pose, by_host = by_pose / _STEP, by_host / _STEP
-        sigma = sigma_px[chosen.epipolar]
-        weight = 1.0 / (1.0 + (error / sigma) ** 2 / 4.0) ** 2 / sigma**2
+            by_host[:, k] = (moved - error) / _STEP
         normal += (by_pose * weight[:, None]).T @ by_pose
         rhs -= (by_pose * weight[:, None]).T @ error
         attitude = self._attitude(pose)
@@ -207,6 +222,17 @@ class PairEvidence:
             normal[3:, 3:] += information
             rhs[3:] -= information @ off
         return normal, rhs, (by_pose * weight[:, None]).T @ by_host, lever
+
+    def _lines(
+        self, pose: Pose, chosen: NDArray[np.bool_], sigma_px: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return how far off their lines (K,) matches are, slopes by pose (K, 6), weights (K,)."""
+        error = self._epipolar_px(pose, chosen)
+        by_pose = np.empty((len(error), 6))
+        for k, nudge in enumerate(_STEP * np.eye(6)):
+            by_pose[:, k] = (self._epipolar_px(pose.retracted(nudge), chosen) - error) / _STEP
+        sigma = sigma_px[chosen]
+        return error, by_pose, _weight((error / sigma) ** 2) / sigma**2
 
     def _attitude(self, pose: Pose) -> tuple[Array, Array] | None:
         """Return (3,) how far the rotation is off the autopilots', body axes, and its weight."""
@@ -254,7 +280,7 @@ class PairEvidence:
         residual, information, j_pose, j_point = self._sightings(pose, chosen, sigma_px)
         squared = np.einsum("nk,nkl,nl->n", residual, information, residual)
         weighted = np.einsum("nki,nkl->nil", j_pose, information)
-        weighted /= (1.0 + squared / 4.0)[:, None, None] ** 2
+        weighted *= _weight(squared)[:, None, None]
         levers = self.index.uncertainty.landmark_lever[self.landmarks[chosen]]
         lever = np.einsum("nil,nlj,njk->ik", weighted, j_point, levers)
         normal = np.einsum("nik,nkj->ij", weighted, j_pose)
@@ -271,6 +297,11 @@ class PairEvidence:
         length = max(float(np.linalg.norm(relative.translation)), 1e-9)
         unit = Pose(relative.rotation, relative.translation / length)
         return sampson_px(unit, self.ideal_host[chosen], self.ideal_target[chosen], self.focal_px)
+
+
+def _weight(squared: Array) -> Array:
+    """Return what a match counts whose normalised error squared is this (Geman-McClure)."""
+    return np.asarray(1.0 / (1.0 + squared / 4.0) ** 2)
 
 
 def _parallax(target_from_host: Pose, ideal_host: Array, ideal_target: Array) -> Array:
