@@ -24,7 +24,7 @@ from sitl.result import DroneResult, FlightResult
 from vcl_companion.geometry.rotation import Array
 
 OWN = "#8a96a3"
-WITHOUT = "#cc79a7"
+WITHOUT = "#8c564b"
 _TRUTH: dict[str, Any] = {"color": INK, "lw": 1.1, "dashes": (4, 2), "zorder": 3}
 
 

@@ -251,7 +251,7 @@ def _figures(
     if sparse is not None:
         note = (
             "Grey: own fixes (intra). In colour: proposals of the host (inter). Ink: what was sent "
-            "with fusion; violet: without. Crosses at the foot: refused frames."
+            "with fusion; brown: without. Crosses at the foot: refused frames."
         )
         svg = paper_figures.sparse_svg(sparse, flights.get(("sparse", False)))
         out.append(section(f"Fig. 7: sparse{of}", note + _unsaid(sparse), svg))
