@@ -48,7 +48,7 @@ class LocalizationOptions:
     detector: Detector = "akaze"
     min_inliers: int = 15
     guided_radius_px: float = 40.0
-    noise_floor_px: float = 0.5
+    noise_floor_px: float = 0.4
     bias_px_per_deg: float = 0.03
     bias_px_per_octave: float = 1.5
     max_sigma_m: float = 1.0

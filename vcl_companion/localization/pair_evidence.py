@@ -52,7 +52,7 @@ class InterOptions:
     max_scale_spread: float = 0.3
     attitude_sigma_deg: float = 4.0
     tilt_sigma_deg: float = 1.5
-    noise_floor_px: float = 0.5
+    noise_floor_px: float = 0.4
     bias_px_per_deg: float = 0.03
     max_sigma_m: float = 2.0
 
