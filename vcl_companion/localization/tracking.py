@@ -11,7 +11,7 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, euler_from_matrix
 from vcl_companion.localization.intra import Localized, NotLocalized, Prior
-from vcl_companion.localization.templates import Templates
+from vcl_companion.mapping.templates import Templates
 from vcl_companion.vision.features import Image
 from vcl_companion.vision.information import covariance_of
 from vcl_companion.vision.patches import (
@@ -32,7 +32,9 @@ _MAX_LEVERAGE = 0.4
 _ROBUST_LOSS = 1.1136
 _SINGULAR = 1e-9
 _MAX_ROUNDS = 3
-_WIDE, _NARROW = np.array([8.0, 3.0, 1.0, 1.0]), np.array([3.0, 1.0, 1.0])
+_WIDE, _NARROW = np.array([8.0, 3.0, 1.0]), np.array([1.0])
+# Patches warped and begun so near to where they are need no second look.
+_WELL_PREDICTED_PX = 0.5
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,6 @@ class TrackingOptions:
 
     n_landmarks: int = 400
     n_coarse: int = 120
-    passes: int = 2
     min_inliers: int = 15
     max_radius_px: float = 80.0
     least_score: float = 0.75
@@ -67,7 +68,7 @@ class TrackingOptions:
     misplaced_px: float = 0.04
     misplaced_px_per_deg: float = 0.009
     misplaced_px_per_octave: float = 0.03
-    misplaced_by_residual: float = 2.0
+    misplaced_by_residual: float = 1.5
     max_sigma_m: float = 1.0
     max_tilt_deg: float = 6.0
     max_heading_deg: float = 25.0
@@ -175,7 +176,7 @@ class _Tracker:
         refined = self._refined(found, pose, None, _WIDE)
         if isinstance(refined, NotLocalized):
             return refined
-        if options.passes > 1:
+        if float(np.median(np.abs(found.pixels - found.predicted))) > _WELL_PREDICTED_PX:
             found = self._aligned(rows, refined, np.zeros(len(rows)), 0, options.least_score)
         return self._judged(found, refined, len(rows), ned_from_body)
 

@@ -8,6 +8,7 @@ is laid out once as plain tables for the compiled loops (``patch_kernels``).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -70,6 +71,7 @@ class Lens:
     size_px: tuple[int, int]
 
 
+@lru_cache(maxsize=64)
 def lens_of(camera: Camera) -> Lens:
     """Lay out a camera's intrinsics."""
     table = np.zeros(kernels.N_LENS)
@@ -265,7 +267,7 @@ class AlignRules:
     misplaced_px: float = 0.04
     misplaced_px_per_rad: float = 0.5
     misplaced_px_per_octave: float = 0.03
-    misplaced_by_residual: float = 2.0
+    misplaced_by_residual: float = 1.5
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -42,6 +43,9 @@ _INCLINATION = 1.0
 # A point that projects farther than this from where it was seen is a wrong one.
 _MAX_REPROJECTION_PX = 2.0
 _CHI2_1_99 = 6.63
+# Keyframe poses of maps against truth had 2.7 to 4.5 times the variance that independent
+# pixel noise explains: what a detector misplaces is alike in neighbouring landmarks.
+_KEYFRAME_OPTIMISM = 4.0
 _RULES = AlignRules(max_iterations=12, least_score=0.8, max_moved_px=3.0)
 
 
@@ -51,7 +55,7 @@ class Templates:
 
     Attributes:
         anchors: landmarks in keyframes.
-        uncertainty: the map's joint covariance.
+        uncertainty: the map's joint covariance, its keyframes' part as large as it proved to be.
     """
 
     anchors: Anchors
@@ -68,6 +72,9 @@ def prepare_templates(landmark_map: LandmarkMap, uncertainty: MapUncertainty) ->
     Raises:
         ValueError: an image cannot be decoded, or no landmark has a patch.
     """
+    uncertainty = replace(
+        uncertainty, keyframe_covariance=_KEYFRAME_OPTIMISM * uncertainty.keyframe_covariance
+    )
     images = [decode_image(k.image_bytes, k.camera) for k in landmark_map.keyframes]
     lenses = [lens_of(k.camera) for k in landmark_map.keyframes]
     shared = (
@@ -148,21 +155,16 @@ def _anchored(
 
 def _texture(image: Image, pixels: Array) -> Array:
     """Return (M, 3) xx xy yy of the squared gradient summed over the patch at each pixel."""
-    grey = image.astype(np.float32)
-    gx, gy = np.zeros_like(grey), np.zeros_like(grey)
-    gx[:, 1:-1] = 0.5 * (grey[:, 2:] - grey[:, :-2])
-    gy[1:-1] = 0.5 * (grey[2:] - grey[:-2])
+    gx = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=1) * 0.5
+    gy = cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=1) * 0.5
+    side = 2 * _HALF_PX + 1
     at = np.round(pixels).astype(np.intp)
-    out = np.empty((len(pixels), 3))
-    for c, product in enumerate((gx * gx, gx * gy, gy * gy)):
-        total = np.zeros((grey.shape[0] + 1, grey.shape[1] + 1))
-        total[1:, 1:] = product.cumsum(axis=0, dtype=np.float64).cumsum(axis=1)
-        top, left = at[:, 1] - _HALF_PX, at[:, 0] - _HALF_PX
-        bottom, right = at[:, 1] + _HALF_PX + 1, at[:, 0] + _HALF_PX + 1
-        out[:, c] = (
-            total[bottom, right] - total[top, right] - total[bottom, left] + total[top, left]
-        )
-    return out
+    return np.column_stack(
+        [
+            cv2.boxFilter(product, cv2.CV_32F, (side, side), normalize=False)[at[:, 1], at[:, 0]]
+            for product in (gx * gx, gx * gy, gy * gy)
+        ]
+    ).astype(np.float64)
 
 
 def _rays_world(anchors: Anchors) -> Array:
