@@ -1,4 +1,4 @@
-"""A painted world with depth, photographed from anywhere, and the map of it that knows the truth."""
+"""A painted world with depth, photographed from anywhere, and a true map of it."""
 
 from __future__ import annotations
 
@@ -104,7 +104,6 @@ def painted_map(
     depth = rays_first @ cams[0].rotation[:, 2]
     off = noise_px * depth / (camera.focal_px * baseline) * rng.standard_normal(len(points))
     points = points + rays_first * off[:, None]
-    seen[:, 0] += 0.0
     return LandmarkMap(
         keyframes=tuple(
             Keyframe(

@@ -15,8 +15,8 @@ from vcl_companion.mapping.templates import Templates
 from vcl_companion.vision.features import Image
 from vcl_companion.vision.information import covariance_of
 from vcl_companion.vision.patches import (
-    AlignRules,
     Alignment,
+    AlignRules,
     Anchors,
     ChoiceRules,
     Lens,
@@ -156,9 +156,7 @@ class _Tracker:
         self._anchors: Anchors = templates.anchors
         self._options = options
 
-    def located(
-        self, prior: Prior, ned_from_body: Array | None
-    ) -> Localized | NotLocalized:
+    def located(self, prior: Prior, ned_from_body: Array | None) -> Localized | NotLocalized:
         options = self._options
         pose = prior.world_from_body
         rows, radii = self._choose(prior)
@@ -168,7 +166,9 @@ class _Tracker:
         if radius > options.max_radius_px:
             return NotLocalized(f"the prediction is {radius:.0f} px uncertain")
         if radius > 1.5:
-            coarse = self._coarse(rows[: options.n_coarse], radii[: options.n_coarse], prior, radius)
+            coarse = self._coarse(
+                rows[: options.n_coarse], radii[: options.n_coarse], prior, radius
+            )
             if isinstance(coarse, NotLocalized):
                 return coarse
             pose = coarse

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.drone_view import decode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
@@ -26,9 +25,8 @@ from vcl_companion.vision.patch_kernels import OUTSIDE
 from vcl_companion.vision.patches import (
     AlignRules,
     Anchors,
-    Ints,
-    KeyframeImages,
     Lens,
+    Pyramid,
     align_patches,
     keyframe_images,
     lens_of,
@@ -96,9 +94,7 @@ def prepare_templates(landmark_map: LandmarkMap, uncertainty: MapUncertainty) ->
     own = _rays_world(anchors) * (sigma * depth**2)[:, None]
     marginals = shared[anchors.landmark] + own[:, :, None] * own[:, None, :]
     upper = np.triu_indices(3)
-    return Templates(
-        replace(anchors, own=own, marginals=marginals[:, *upper]), uncertainty
-    )
+    return Templates(replace(anchors, own=own, marginals=marginals[:, *upper]), uncertainty)
 
 
 def _anchored(
@@ -224,7 +220,7 @@ def _inclined(anchors: Anchors, sigma: Array) -> Anchors:
 
 
 def _measured(
-    anchors: Anchors, sigma: Array, frames: list, lenses: list[Lens]
+    anchors: Anchors, sigma: Array, frames: list[Pyramid], lenses: list[Lens]
 ) -> tuple[Anchors, Array, NDArray[np.bool_]]:
     """Measure every inverse depth by where the patch lies in the other keyframes.
 

@@ -71,9 +71,7 @@ def bent(lens: Array, x: float, y: float) -> tuple[float, float, float, float, f
 
 
 @compiled
-def seen_from(
-    plane: Array, lens: Array, reach: float, transform: Array, out: Array
-) -> bool:
+def seen_from(plane: Array, lens: Array, reach: float, transform: Array, out: Array) -> bool:
     """Fill what one anchor looks like from a frame; False where it cannot be seen.
 
     ``out`` (13,): ideal x, y; 1/depth in the frame; pixel u, v; slopes of the
@@ -140,8 +138,10 @@ def warped(
     """Fill (SIDE + 2, SIDE + 2) grey levels of a keyframe around a pixel, by an affine map.
 
     Args:
-        texels, shelves: the keyframe's pyramid, (L, 3).
-        key_u, key_v: the patch's centre in the keyframe.
+        texels: of all keyframes.
+        shelves: (L, 3) the keyframe's pyramid.
+        key_u: column of the patch's centre in the keyframe.
+        key_v: its row.
         back: (4,) d(keyframe pixel) / d(patch pixel).
         out: the patch with a margin of one.
 
@@ -167,9 +167,7 @@ def warped(
             return False
         for i in range(-reach, reach + 1):
             for j in range(-reach, reach + 1):
-                grey = sampled(
-                    texels, start, height, width, su + a * j + b * i, sv + c * j + d * i
-                )
+                grey = sampled(texels, start, height, width, su + a * j + b * i, sv + c * j + d * i)
                 if step == 0:
                     out[i + reach, j + reach] = weight * grey
                 else:
@@ -204,7 +202,10 @@ def choose(
     Args:
         first: (N + 1,) where each landmark's anchors begin.
         keyframe: (A,) of each anchor.
-        planes, lens, reach, transforms: see the module.
+        planes: see the module.
+        lens: of the frame.
+        reach: of that lens.
+        transforms: to the frame, see the module.
         marginals: (A, 6) xx xy xz yy yz zz of each anchor's point, world axes, m^2.
         texture: (A, 3) xx, xy, yy of the summed squared gradient of its patch.
         cam_from_world: (3, 3) rotation.
@@ -334,7 +335,9 @@ def choose(
 @compiled
 def _across(row: Array, matrix: Array, column: int) -> float:
     """Return one element of a (3,) row times a (3, 3) matrix."""
-    return float(row[0] * matrix[0, column] + row[1] * matrix[1, column] + row[2] * matrix[2, column])
+    return float(
+        row[0] * matrix[0, column] + row[1] * matrix[1, column] + row[2] * matrix[2, column]
+    )
 
 
 @compiled
@@ -409,9 +412,16 @@ def align(
 
     Args:
         chosen: (M,) anchors.
-        keyframe, planes, key_pixels (A, 2), texels, shelves: the map's anchors.
-        lens, reach, transforms: the frame's.
-        image, levels: the frame's pyramid, (L, 3).
+        keyframe: (A,) of each anchor.
+        planes: see the module.
+        key_pixels: (A, 2) of each anchor.
+        texels: of all keyframes.
+        shelves: (V, L, 3) of all keyframes.
+        lens: of the frame.
+        reach: of that lens.
+        transforms: to the frame, see the module.
+        image: texels of the frame's pyramid.
+        levels: (L, 3) shelves of the frame's pyramid.
         radii: (M,) how far around the prediction to search first, px of the full image;
             below one pixel of the level there is no search.
         rules: (8,) iterations; least score; how far an alignment may move from
@@ -433,7 +443,6 @@ def align(
     view = np.empty(13)
     patch = np.empty((SIDE + 2, SIDE + 2))
     basis = np.empty((3, SIDE, SIDE))
-    window = np.empty((SIDE, SIDE))
     back = np.empty(4)
     normal, inverse = np.empty((3, 3)), np.empty((3, 3))
     for i in range(m):
@@ -492,7 +501,7 @@ def align(
         reach_px = radii[i] / size
         if reach_px >= 1.0:
             u, v, peak = _searched(
-                image, start, height, width, u0, v0, int(math.ceil(reach_px)), basis[0], energy
+                image, start, height, width, u0, v0, math.ceil(reach_px), basis[0], energy
             )
             if peak < 0.5 * rules[1]:
                 status[i] = UNLIKE
@@ -558,9 +567,7 @@ def align(
         noises[i, 2] = variance * inverse[2, 2]
         half_angle, octaves = change_of_view(planes[anchor], transforms[k])
         spread = (
-            (rules[4] * size) ** 2
-            + (2.0 * rules[5] * half_angle) ** 2
-            + (rules[6] * octaves) ** 2
+            (rules[4] * size) ** 2 + (2.0 * rules[5] * half_angle) ** 2 + (rules[6] * octaves) ** 2
         )
         share = rules[7] * rules[7]
         misplaced[i, 0] = spread + share * noises[i, 0]
@@ -600,7 +607,7 @@ def _searched(
     Whole steps around the prediction, so that a right one is not moved.
     """
     best, best_u, best_v = -2.0, u0, v0
-    column, row = int(math.floor(u0 + 0.5)), int(math.floor(v0 + 0.5))
+    column, row = math.floor(u0 + 0.5), math.floor(v0 + 0.5)
     for dv in range(-radius, radius + 1):
         centre_v = row + dv
         if centre_v < HALF or centre_v >= height - HALF:

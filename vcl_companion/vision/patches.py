@@ -150,15 +150,13 @@ class KeyframeImages:
         return out
 
 
-def keyframe_images(
-    images: list[Image], worlds_from_cams: list[Pose]
-) -> KeyframeImages:
+def keyframe_images(images: list[Image], worlds_from_cams: list[Pose]) -> KeyframeImages:
     """Lay out the images of V keyframes; their pyramids get as many levels as the smallest has."""
     pyramids = [pyramid_of(image) for image in images]
     n_levels = min(len(p.shelves) for p in pyramids)
     starts = np.concatenate([[0], np.cumsum([len(p.texels) for p in pyramids])[:-1]])
     shelves = np.stack(
-        [p.shelves[:n_levels] + [s, 0, 0] for p, s in zip(pyramids, starts, strict=True)]
+        [p.shelves[:n_levels] + np.array([s, 0, 0]) for p, s in zip(pyramids, starts, strict=True)]
     )
     return KeyframeImages(
         np.concatenate([p.texels for p in pyramids]),

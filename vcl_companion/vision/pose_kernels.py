@@ -74,7 +74,9 @@ def converged(
                     weighted[1, c] = weight * (xy * j_pose[0, c] + yy * j_pose[1, c])
                 for c in range(6):
                     for d in range(c + 1):
-                        normal[c, d] += weighted[0, c] * j_pose[0, d] + weighted[1, c] * j_pose[1, d]
+                        normal[c, d] += (
+                            weighted[0, c] * j_pose[0, d] + weighted[1, c] * j_pose[1, d]
+                        )
                     rhs[c] -= weighted[0, c] * residual[0] + weighted[1, c] * residual[1]
             for c in range(6):
                 for d in range(c):
@@ -106,7 +108,13 @@ def supported(
     """Find who agrees with a pose.
 
     Args:
-        pose: (3, 4), and the others: as in ``converged``.
+        pose: (3, 4) world_from_body.
+        body_from_cam: (3, 4), this and the next: as in ``converged``.
+        ideal: (M, 2).
+        slopes: (M, 2, 2).
+        points: (M, 3).
+        point_covariances: (M, 6).
+        pixel_covariances: (M, 3).
         largest: squared Mahalanobis length of a residual that still agrees.
 
     Returns:
@@ -162,9 +170,13 @@ def gained(
     """Carry the errors of everything that fixed a pose over to it (eq. 12, and the map's).
 
     Args:
-        agrees, j_poses, j_points, informations: of ``supported``.
+        agrees: (M,) of ``supported``, like the three after the inverse.
         inverse: (6, 6) of its normal matrix.
-        noises, misplaced: (M, 3) xx xy yy of each pixel, px^2.
+        j_poses: (M, 2, 6).
+        j_points: (M, 2, 3).
+        informations: (M + 1, 3).
+        noises: (M, 3) xx xy yy of each pixel, new in every frame, px^2.
+        misplaced: (M, 3) the same of what is alike in every frame, px^2.
         owns: (M, 3) 1-sigma displacement of each landmark by its own depth, world, m.
         landmarks: (M,) rows of ``levers``.
         levers: (N, 3, K) landmark error per keyframe error.
@@ -200,9 +212,7 @@ def gained(
         for c in range(6):
             depth[c] = 0.0
             for r in range(3):
-                by_point[c, r] = -(
-                    gain[c, 0] * j_points[i, 0, r] + gain[c, 1] * j_points[i, 1, r]
-                )
+                by_point[c, r] = -(gain[c, 0] * j_points[i, 0, r] + gain[c, 1] * j_points[i, 1, r])
                 depth[c] += by_point[c, r] * owns[i, r]
                 for d in range(k):
                     lever[c, d] += by_point[c, r] * levers[landmark, r, d]
