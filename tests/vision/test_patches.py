@@ -107,7 +107,7 @@ def test_the_affine_map_is_the_derivative_of_the_true_mapping(camera: Camera) ->
     def elsewhere(key_pixel: Array) -> Array:
         p, q = camera.ideal_from_pixels(key_pixel[None])[0]
         point = np.array([p, q, 1.0]) / (r + b * (p - x) + c * (q - y))
-        return camera.project(frame_from_key.apply(point)[None])[0]
+        return np.asarray(camera.project(frame_from_key.apply(point)[None])[0])
 
     out, lens = np.empty(13), lens_of(camera)
     plane = np.array([x, y, r, b, c, *slopes])
@@ -125,22 +125,24 @@ def test_a_shifted_image_is_found_to_a_few_hundredths(
     shift: tuple[float, float], gain: float, offset: float
 ) -> None:
     rng = np.random.default_rng(4)
-    image = cv2.GaussianBlur(painted(rng), (0, 0), 0.7)
+    image = np.asarray(cv2.GaussianBlur(painted(rng), (0, 0), 0.7), dtype=np.uint8)
     # By Fourier's theorem; a warp by OpenCV is itself off by 0.05 px.
     row, column = np.fft.fftfreq(480)[:, None], np.fft.fftfreq(640)[None]
     phase = np.exp(-2j * np.pi * (column * shift[0] + row * shift[1]))
-    moved = np.fft.ifft2(np.fft.fft2(image.astype(float)) * phase).real * gain + offset
-    moved = np.clip(np.rint(moved + rng.standard_normal(moved.shape)), 0, 255).astype(np.uint8)
+    exact = np.fft.ifft2(np.fft.fft2(image.astype(float)) * phase).real * gain + offset
+    noisy = np.rint(exact + rng.standard_normal(exact.shape))
+    moved = np.clip(noisy, 0, 255).astype(np.uint8)
     pixels = rng.uniform(30.0, [610.0, 450.0], (150, 2))
     found = aligned(anchored(image, pixels), moved, Pose.identity())
     good = found.found
     assert good.mean() > 0.9
     error = (found.pixels - found.predicted)[good] - shift
-    assert np.median(np.abs(error)) < 0.03
-    assert np.abs(np.median(error, axis=0)).max() < 0.02
+    # One grey level of noise is more of a picture of less contrast.
+    assert np.median(np.abs(error)) < 0.02 / gain
+    assert np.abs(np.median(error, axis=0)).max() < 0.01 / gain
     # What is left is what the residual of the grey levels says.
     sigma = np.sqrt(found.noise[good][:, [0, 2]])
-    assert 0.3 < np.median(np.abs(error) / sigma) / 0.6745 < 3.0
+    assert 0.7 < np.median(np.abs(error) / sigma) / 0.6745 < 1.4
     expected = PINHOLE.ideal_from_pixels(found.pixels[good])
     assert np.allclose(found.ideal[good], expected, atol=1e-9)
 

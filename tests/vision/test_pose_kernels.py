@@ -15,13 +15,14 @@ from vcl_companion.vision.resection import Resection, ResectionOptions, Sighting
 
 _SCALES = np.array([8.0, 3.0, 1.0, 1.0])
 _UPPER = np.triu_indices(3)
+System = tuple[Array, Array, Array, Array, Array, Array]
 
 
 def rows(pose: Pose) -> Array:
     return np.ascontiguousarray(pose.matrix()[:3])
 
 
-def both(rng: np.random.Generator, camera: Camera) -> tuple[Sightings, Pose, tuple[Array, ...]]:
+def both(rng: np.random.Generator, camera: Camera) -> tuple[Sightings, Pose, System]:
     """Sightings with noise, a fifth of them wrong; the first guess; the same for the kernel."""
     scene = facade_scene(rng, 250, 3.0, camera=camera, noise_px=0.4, outliers=0.2)
     seen = scene.seen[:, 1]
@@ -60,7 +61,7 @@ def test_the_same_pose_and_covariance_as_the_refinement_in_arrays(camera: Camera
     leverage, parts, lever = gained(
         agrees, np.linalg.inv(normal), j_pose, j_point, information,
         np.tile([0.16, 0.0, 0.16], (n, 1)), np.tile([0.09, 0.0, 0.09], (n, 1)),
-        own, np.arange(n), levers,
+        own, np.arange(n, dtype=np.int64), levers,
     )  # fmt: skip
     assert np.allclose(1.1136 * parts[0], expected.noise_covariance, rtol=1e-4)
     assert np.allclose(1.1136 * parts[1], expected.bias_covariance, rtol=1e-4)

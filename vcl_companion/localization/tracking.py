@@ -233,7 +233,9 @@ class _Tracker:
         n = len(found.anchors)
         if n < self._options.min_inliers:
             return NotLocalized(f"{n} patches found, {self._options.min_inliers} needed", n)
-        known = np.zeros((6, 6)) if prior is None else np.linalg.inv(prior.covariance)
+        known = np.zeros((6, 6))
+        if prior is not None:
+            known = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
         matrix, outcome = converged(*self._system(pose, found), known, scales)
         if outcome != CONVERGED:
             return NotLocalized("the patches found do not fix a pose", n)

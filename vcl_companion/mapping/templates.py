@@ -195,8 +195,10 @@ def _inclined(anchors: Anchors, sigma: Array) -> Anchors:
         length2 = 1.0 + x * x + y * y
         facing = np.column_stack([x, y]) * (r / length2)[:, None]
         near = min(_N_NEIGHBOURS, len(rows))
-        distance, other = cKDTree(anchors.pixels[rows]).query(anchors.pixels[rows], near)
-        distance, other = distance.reshape(len(rows), -1), other.reshape(len(rows), -1)
+        distance, other = (
+            np.asarray(of_each).reshape(len(rows), near)
+            for of_each in cKDTree(anchors.pixels[rows]).query(anchors.pixels[rows], near)
+        )
         dx, dy = x[other] - x[:, None], y[other] - y[:, None]
         dr = r[other] - r[:, None]
         variance = sigma[rows][other] ** 2 + sigma[rows][:, None] ** 2

@@ -31,6 +31,8 @@ Texels = NDArray[np.uint8]
 N_LENS = 10
 HALF = 4
 SIDE = 2 * HALF + 1
+# By how much bilinear interpolation reduces the variance of white noise, on average.
+_SMOOTHED = 4.0 / 9.0
 # Why a patch was not found.
 FOUND, OUTSIDE, FLAT, UNLIKE, WANDERED, UNSETTLED = 0, 1, 2, 3, 4, 5
 
@@ -101,7 +103,7 @@ def seen_from(plane: Array, lens: Array, reach: float, transform: Array, out: Ar
     out[9], out[10] = mxx * ixx + mxy * iyx, mxx * ixy + mxy * iyy
     out[11], out[12] = myx * ixx + myy * iyx, myx * ixy + myy * iyy
     # A patch seen from behind, or edge on, says nothing.
-    return out[9] * out[12] - out[10] * out[11] > 1e-3
+    return bool(out[9] * out[12] - out[10] * out[11] > 1e-3)
 
 
 @compiled
@@ -128,7 +130,7 @@ def sampled(texels: Texels, start: int, height: int, width: int, u: float, v: fl
     at = start + row * width + column
     top = texels[at] * (1.0 - a) + texels[at + 1] * a
     bottom = texels[at + width] * (1.0 - a) + texels[at + width + 1] * a
-    return top * (1.0 - b) + bottom * b
+    return float(top * (1.0 - b) + bottom * b)
 
 
 @compiled
@@ -508,7 +510,7 @@ def align(
                 continue
         begin_u, begin_v = u, v
         status[i] = UNSETTLED
-        score, residual = 0.0, 0.0
+        score, residual, smoothed = 0.0, 0.0, 1.0
         for iteration in range(int(rules[0]) + 1):
             if not (HALF <= u < width - HALF - 1 and HALF <= v < height - HALF - 1):
                 status[i] = OUTSIDE
@@ -517,6 +519,7 @@ def align(
             column, row = int(u), int(v)
             a, b = u - column, v - row
             w00, w01, w10, w11 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
+            smoothed = w00 * w00 + w01 * w01 + w10 * w10 + w11 * w11
             for r in range(SIDE):
                 at = start + (row + r - HALF) * width + column - HALF
                 for c in range(SIDE):
@@ -562,7 +565,9 @@ def align(
         pixels[i, 2], pixels[i, 3] = u * size, v * size
         ideals[i, 0], ideals[i, 1] = view[0], view[1]
         _unbent(lens, u * size, v * size, ideals[i], slopes[i])
-        variance = residual / (SIDE * SIDE - 4.0) * size * size
+        # Interpolating takes noise away pixel by pixel, and spreads it over the neighbours: what
+        # the patch as a whole is off stays. The keyframe's is sampled at all sorts of places.
+        variance = residual / (SIDE * SIDE - 4.0) / (0.5 * (smoothed + _SMOOTHED)) * size * size
         noises[i, 0], noises[i, 1] = variance * inverse[1, 1], variance * inverse[1, 2]
         noises[i, 2] = variance * inverse[2, 2]
         half_angle, octaves = change_of_view(planes[anchor], transforms[k])
@@ -621,7 +626,7 @@ def _searched(
             for r in range(SIDE):
                 at = start + (centre_v + r - HALF) * width + centre_u - HALF
                 for c in range(SIDE):
-                    grey = np.int64(image[at + c])
+                    grey = int(image[at + c])
                     s += grey
                     s2 += grey * grey
                     st += grey * patch[r, c]

@@ -9,9 +9,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.vision.compiled import compiled
+
+Ints = NDArray[np.int64]
 
 _MIN_DEPTH_M = 1e-3
 CONVERGED, SINGULAR, DIVERGED = 0, 1, 2
@@ -84,7 +87,7 @@ def converged(
             for c in range(6):
                 if not (normal[c, c] > 0.0 and math.isfinite(rhs[c])):
                     return now, SINGULAR
-            step = np.linalg.solve(normal, rhs)
+            step = np.asarray(np.linalg.solve(normal, rhs), dtype=np.float64)
             length = math.sqrt(float((step * step).sum()))
             if not length < 1e3:
                 return now, DIVERGED
@@ -104,7 +107,7 @@ def supported(
     point_covariances: Array,
     pixel_covariances: Array,
     largest: float,
-) -> tuple[Array, Array, Array, Array, Array]:
+) -> tuple[Ints, Array, Array, Array, Array]:
     """Find who agrees with a pose.
 
     Args:
@@ -156,7 +159,7 @@ def supported(
 
 @compiled
 def gained(
-    agrees: Array,
+    agrees: Ints,
     inverse: Array,
     j_poses: Array,
     j_points: Array,
@@ -164,7 +167,7 @@ def gained(
     noises: Array,
     misplaced: Array,
     owns: Array,
-    landmarks: Array,
+    landmarks: Ints,
     levers: Array,
 ) -> tuple[Array, Array, Array]:
     """Carry the errors of everything that fixed a pose over to it (eq. 12, and the map's).
