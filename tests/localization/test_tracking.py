@@ -15,14 +15,14 @@ from tests.scenes import CAMERAS, PINHOLE, perturbed
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3
-from vcl_companion.localization.intra import Localized, NotLocalized, Prior
+from vcl_companion.localization.intra import LocalizationOptions, Localized, NotLocalized, Prior
 from vcl_companion.localization.tracking import TrackingOptions, track
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.mapping.uncertainty import map_uncertainty
 from vcl_companion.vision.features import Image
 
-OPTIONS = TrackingOptions()
+OPTIONS, BELIEF = TrackingOptions(), LocalizationOptions()
 # Back, aside and turned: a fifth smaller than in the keyframes.
 TRUTH = Pose(exp_so3(np.array([0.03, 0.02, -0.05])), np.array([-2.5, 0.8, -0.4]))
 _SIGMA = np.repeat([0.05, 0.004], 3)
@@ -55,7 +55,7 @@ def tracked(
     camera: Camera = PINHOLE,
     options: TrackingOptions = OPTIONS,
 ) -> Localized:
-    fix = track(image, camera, MOUNTING, templates, prior, None, options)
+    fix = track(image, camera, MOUNTING, templates, prior, None, options, BELIEF)
     assert isinstance(fix, Localized), fix.reason
     return fix
 
@@ -225,9 +225,9 @@ def reason(
     templates: Templates,
     prior: Prior,
     ned_from_body: Array | None = None,
-    options: TrackingOptions = OPTIONS,
+    belief: LocalizationOptions = BELIEF,
 ) -> str:
-    fix = track(image, PINHOLE, MOUNTING, templates, prior, ned_from_body, options)
+    fix = track(image, PINHOLE, MOUNTING, templates, prior, ned_from_body, OPTIONS, belief)
     assert isinstance(fix, NotLocalized)
     return fix.reason
 
@@ -240,15 +240,15 @@ def test_what_is_not_believed_says_why(rng: np.random.Generator, templates: Temp
     behind = Pose(exp_so3(np.array([0.0, 0.0, 2.5])), TRUTH.translation)
     assert "in view" in reason(image, templates, Prior(behind, prior.covariance))
     assert "uncertain" in reason(image, templates, Prior(TRUTH, 25.0 * np.eye(6)))
-    strict = replace(OPTIONS, max_sigma_m=1e-4)
-    assert "too uncertain" in reason(image, templates, prior, options=strict)
+    strict = replace(BELIEF, max_sigma_m=1e-4)
+    assert "too uncertain" in reason(image, templates, prior, belief=strict)
     tilted = TRUTH.rotation @ exp_so3(np.array([0.2, 0.0, 0.0]))
-    assert "attitude" in reason(image, templates, prior, tilted)
+    assert "roll and pitch" in reason(image, templates, prior, tilted)
     turned = exp_so3(np.array([0.0, 0.0, 0.6])) @ TRUTH.rotation
-    assert "attitude" in reason(image, templates, prior, turned)
+    assert "heading" in reason(image, templates, prior, turned)
     upright = exp_so3(np.array([0.0, 0.0, 0.1])) @ TRUTH.rotation
     assert isinstance(
-        track(image, PINHOLE, MOUNTING, templates, prior, upright, OPTIONS), Localized
+        track(image, PINHOLE, MOUNTING, templates, prior, upright, OPTIONS, BELIEF), Localized
     )
 
 
@@ -262,10 +262,10 @@ def test_the_same_frame_gives_the_same_pose(rng: np.random.Generator, templates:
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"min_inliers": 5},
         {"n_coarse": 500},
+        {"n_coarse": 19},
         {"least_score": 1.0},
-        {"max_sigma_m": 0.0},
+        {"max_radius_px": 0.0},
         {"misplaced_px": -1.0},
     ],
 )

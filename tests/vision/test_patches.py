@@ -184,9 +184,10 @@ def test_the_choice_is_spread_and_takes_the_surest() -> None:
     vague = np.arange(1100) % 2 == 0
     marginals[vague, 0] = marginals[vague, 3] = 0.04
     anchors = replace(anchors, marginals=marginals)
-    chosen, radii = choose_anchors(
+    chosen, radii, in_view = choose_anchors(
         anchors, lens_of(PINHOLE), Pose.identity(), Pose.identity(), 1e-4 * np.eye(6), RULES, 200, 6
     )
+    assert in_view == 1100
     assert len(set(chosen.tolist())) == len(chosen) == 200
     assert 0.25 < (chosen >= 1000).mean() < 0.5
     assert vague[chosen[chosen < 1000]].mean() < 0.1

@@ -9,8 +9,15 @@ from numpy.typing import NDArray
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, euler_from_matrix
-from vcl_companion.localization.intra import Localized, NotLocalized, Prior
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.localization.coverage import covered_share
+from vcl_companion.localization.intra import (
+    LocalizationOptions,
+    Localized,
+    NotLocalized,
+    Prior,
+    believed,
+)
 from vcl_companion.mapping.templates import Templates
 from vcl_companion.vision.features import Image
 from vcl_companion.vision.information import covariance_of
@@ -44,7 +51,6 @@ class TrackingOptions:
     Attributes:
         n_landmarks: patches aligned at full resolution.
         n_coarse: of these, how many find the way when the prediction is poor.
-        min_inliers: landmarks that must agree on a pose.
         max_radius_px: a prediction less certain than this, 3 sigma, is no prediction.
         least_score: correlation of an aligned patch, at least.
         coarse_score: the same at reduced resolution.
@@ -53,14 +59,10 @@ class TrackingOptions:
         misplaced_px_per_deg: per angle between the lines of sight of frame and keyframe.
         misplaced_px_per_octave: per doubling or halving of the distance.
         misplaced_by_residual: per sigma that the residual of the grey levels explains.
-        max_sigma_m: a pose less certain than this in any direction is refused.
-        max_tilt_deg: roll and pitch may disagree with the autopilot's by this much.
-        max_heading_deg: heading may disagree with the autopilot's by this much.
     """
 
     n_landmarks: int = 400
     n_coarse: int = 120
-    min_inliers: int = 15
     max_radius_px: float = 80.0
     least_score: float = 0.75
     coarse_score: float = 0.65
@@ -68,16 +70,13 @@ class TrackingOptions:
     misplaced_px: float = 0.04
     misplaced_px_per_deg: float = 0.009
     misplaced_px_per_octave: float = 0.03
-    misplaced_by_residual: float = 1.5
-    max_sigma_m: float = 1.0
-    max_tilt_deg: float = 6.0
-    max_heading_deg: float = 25.0
+    misplaced_by_residual: float = 0.7
 
     def __post_init__(self) -> None:
-        if self.min_inliers < 6:
-            raise ValueError(f"min_inliers must be at least 6, got {self.min_inliers}")
-        if not self.min_inliers <= self.n_coarse <= self.n_landmarks:
-            raise ValueError("tracking needs min_inliers <= n_coarse <= n_landmarks")
+        if not 20 <= self.n_coarse <= self.n_landmarks:
+            raise ValueError(
+                f"n_coarse must lie in 20..n_landmarks, got {self.n_coarse} of {self.n_landmarks}"
+            )
         for name in ("least_score", "coarse_score"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise ValueError(f"{name} must lie in (0, 1), got {getattr(self, name)}")
@@ -88,9 +87,6 @@ class TrackingOptions:
             "misplaced_px_per_deg",
             "misplaced_px_per_octave",
             "misplaced_by_residual",
-            "max_sigma_m",
-            "max_tilt_deg",
-            "max_heading_deg",
         ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
@@ -116,6 +112,7 @@ def track(
     prior: Prior,
     ned_from_body: Array | None,
     options: TrackingOptions,
+    belief: LocalizationOptions,
 ) -> Localized | NotLocalized:
     """Find the drone's pose by the map's patches near where the prediction puts them.
 
@@ -129,12 +126,13 @@ def track(
         templates: the current map, prepared.
         prior: where the drone is expected.
         ned_from_body: (3, 3) attitude by the autopilot at that instant, or None.
-        options: see there.
+        options: how it is tracked.
+        belief: when a pose is believed, whatever it rests on.
 
     Returns:
         The pose with its covariance in parts, or why there is none.
     """
-    tracker = _Tracker(image, camera, body_from_cam, templates, options)
+    tracker = _Tracker(image, camera, body_from_cam, templates, options, belief)
     return tracker.located(prior, ned_from_body)
 
 
@@ -148,20 +146,23 @@ class _Tracker:
         body_from_cam: Pose,
         templates: Templates,
         options: TrackingOptions,
+        belief: LocalizationOptions,
     ) -> None:
         self._frame = pyramid_of(image)
+        self._camera = camera
         self._lens: Lens = lens_of(camera)
         self._mounting = body_from_cam
         self._templates = templates
         self._anchors: Anchors = templates.anchors
         self._options = options
+        self._belief = belief
 
     def located(self, prior: Prior, ned_from_body: Array | None) -> Localized | NotLocalized:
         options = self._options
         pose = prior.world_from_body
-        rows, radii = self._choose(prior)
-        if len(rows) < options.min_inliers:
-            return NotLocalized(f"{len(rows)} landmarks in view, {options.min_inliers} needed")
+        rows, radii, in_view = self._choose(prior)
+        if len(rows) < self._belief.min_inliers:
+            return NotLocalized(f"{len(rows)} landmarks in view, {self._belief.min_inliers} needed")
         radius = float(np.quantile(radii, 0.75))
         if radius > options.max_radius_px:
             return NotLocalized(f"the prediction is {radius:.0f} px uncertain")
@@ -178,9 +179,9 @@ class _Tracker:
             return refined
         if float(np.median(np.abs(found.pixels - found.predicted))) > _WELL_PREDICTED_PX:
             found = self._aligned(rows, refined, np.zeros(len(rows)), 0, options.least_score)
-        return self._judged(found, refined, len(rows), ned_from_body)
+        return self._judged(found, refined, len(rows), in_view, ned_from_body)
 
-    def _choose(self, prior: Prior) -> tuple[NDArray[np.int64], Array]:
+    def _choose(self, prior: Prior) -> tuple[NDArray[np.int64], Array, int]:
         return choose_anchors(
             self._anchors,
             self._lens,
@@ -231,8 +232,8 @@ class _Tracker:
         self, found: Alignment, pose: Pose, prior: Prior | None, scales: Array
     ) -> Pose | NotLocalized:
         n = len(found.anchors)
-        if n < self._options.min_inliers:
-            return NotLocalized(f"{n} patches found, {self._options.min_inliers} needed", n)
+        if n < self._belief.min_inliers:
+            return NotLocalized(f"{n} patches found, {self._belief.min_inliers} needed", n)
         known = np.zeros((6, 6))
         if prior is not None:
             known = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
@@ -255,7 +256,12 @@ class _Tracker:
         )
 
     def _judged(
-        self, found: Alignment, pose: Pose, n_tried: int, ned_from_body: Array | None
+        self,
+        found: Alignment,
+        pose: Pose,
+        n_tried: int,
+        in_view: int,
+        ned_from_body: Array | None,
     ) -> Localized | NotLocalized:
         """Refine a last time, and say how certain the pose is."""
         uncertainty = self._templates.uncertainty
@@ -268,8 +274,8 @@ class _Tracker:
                 *self._system(pose, found), 2.0 * _CHI2_2_99
             )
             n = int(agrees.sum())
-            if n < self._options.min_inliers:
-                least = self._options.min_inliers
+            if n < self._belief.min_inliers:
+                least = self._belief.min_inliers
                 return NotLocalized(f"{n} landmarks agree on a pose, {least} needed", n_tried, n)
             inverse = covariance_of(normal, _SINGULAR)
             if inverse is None:
@@ -296,31 +302,9 @@ class _Tracker:
             n,
             True,
             float(np.sqrt(information[-1, 0] / n)),
+            # Those that were not tried would fare like those that were.
+            round(in_view * n / n_tried),
+            covered_share(found.pixels[agrees > 0], self._camera),
+            "patches",
         )
-        return self._believed(fix, ned_from_body)
-
-    def _believed(self, fix: Localized, ned_from_body: Array | None) -> Localized | NotLocalized:
-        options = self._options
-        covariance = fix.covariance()
-        if not np.all(np.isfinite(covariance)):
-            return NotLocalized("the patches do not fix a pose", fix.n_matched, fix.n_inliers)
-        sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-        if sigma > options.max_sigma_m:
-            return NotLocalized(
-                f"too uncertain: {sigma:.1f} m, {options.max_sigma_m:.1f} m allowed",
-                fix.n_matched,
-                fix.n_inliers,
-            )
-        if ned_from_body is None:
-            return fix
-        rotation = fix.world_from_body.rotation
-        tilt = np.rad2deg(np.arccos(np.clip(rotation[2] @ ned_from_body[2], -1.0, 1.0)))
-        heading = abs(np.rad2deg(euler_from_matrix(rotation @ ned_from_body.T)[2]))
-        if tilt > options.max_tilt_deg or heading > options.max_heading_deg:
-            return NotLocalized(
-                f"disagrees with the autopilot's attitude by {tilt:.0f} degrees of tilt, "
-                f"{heading:.0f} of heading",
-                fix.n_matched,
-                fix.n_inliers,
-            )
-        return fix
+        return believed(fix, ned_from_body, self._belief)

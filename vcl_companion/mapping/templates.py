@@ -67,8 +67,11 @@ def prepare_templates(landmark_map: LandmarkMap, uncertainty: MapUncertainty) ->
         landmark_map: any revision.
         uncertainty: its own (``map_uncertainty``).
 
+    Returns:
+        The anchors; none where nothing of the map can be found again in its keyframes.
+
     Raises:
-        ValueError: an image cannot be decoded, or no landmark has a patch.
+        ValueError: an image cannot be decoded.
     """
     uncertainty = replace(
         uncertainty, keyframe_covariance=_KEYFRAME_OPTIMISM * uncertainty.keyframe_covariance
@@ -88,8 +91,6 @@ def prepare_templates(landmark_map: LandmarkMap, uncertainty: MapUncertainty) ->
         anchors, sigma, good = _measured(anchors, sigma, frames, lenses)
     anchors, sigma = _only(anchors, sigma, good)
     anchors = _inclined(anchors, sigma)
-    if len(anchors.landmark) == 0:
-        raise ValueError("no landmark of the map has a patch in its keyframes")
     depth = 1.0 / anchors.planes[:, 2]
     own = _rays_world(anchors) * (sigma * depth**2)[:, None]
     marginals = shared[anchors.landmark] + own[:, :, None] * own[:, None, :]

@@ -193,7 +193,7 @@ def choose(
     image: Array,
     rules: Array,
     wanted: int,
-) -> tuple[Ints, Array]:
+) -> tuple[Ints, Array, int]:
     """Choose the landmarks that fix the pose best, and the keyframe to take each of them from.
 
     A landmark's worth is its share of what all landmarks in view together know
@@ -219,7 +219,8 @@ def choose(
         wanted: how many, at most.
 
     Returns:
-        (K,) anchors, best first; (K,) three sigma of where each will appear, px.
+        (K,) anchors, best first; (K,) three sigma of where each will appear, px; how many
+        landmarks were there to choose from.
     """
     n = len(first) - 1
     anchors, cells = np.empty(n, np.int64), np.empty(n, np.int64)
@@ -289,7 +290,7 @@ def choose(
         cells[count] = int(v / rules[0]) * columns + int(u / rules[0])
         count += 1
     if count == 0:
-        return anchors[:0], worth[:0]
+        return anchors[:0], worth[:0], 0
     for c in range(6):
         total[c, c] = total[c, c] * (1.0 + 1e-6) + 1e-12
         for d in range(c):
@@ -331,7 +332,7 @@ def choose(
                 radii[filled] = 3.0 * math.sqrt(max(spread, 0.0))
                 filled += 1
         turn += 1
-    return chosen, radii
+    return chosen, radii, count
 
 
 @compiled

@@ -197,7 +197,7 @@ def choose_anchors(
     rules: ChoiceRules,
     wanted: int,
     margin_px: float,
-) -> tuple[Ints, Array]:
+) -> tuple[Ints, Array, int]:
     """Choose the landmarks that fix the pose best, spread over the image.
 
     Args:
@@ -211,7 +211,8 @@ def choose_anchors(
         margin_px: no landmark nearer to the image's border.
 
     Returns:
-        (K,) anchors, the best of each cell first; (K,) 3 sigma of where each will appear, px.
+        (K,) anchors, the best of each cell first; (K,) 3 sigma of where each will appear,
+        px; how many landmarks are in view.
     """
     cam_from_world = (world_from_body @ body_from_cam).inverse()
     images = anchors.images
@@ -265,7 +266,7 @@ class AlignRules:
     misplaced_px: float = 0.04
     misplaced_px_per_rad: float = 0.5
     misplaced_px_per_octave: float = 0.03
-    misplaced_by_residual: float = 1.5
+    misplaced_by_residual: float = 0.7
 
 
 @dataclass(frozen=True, eq=False)

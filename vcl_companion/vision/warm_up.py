@@ -60,7 +60,7 @@ def _track(rng: np.random.Generator) -> None:
     )
     lens, frame = lens_of(camera), pyramid_of(image)
     rules = ChoiceRules(40.0, 4.0, 0.05, 0.5, 0.03, 1.5, 3.5)
-    rows, _ = choose_anchors(anchors, lens, still, still, np.eye(6), rules, n, 6.0)
+    rows, *_ = choose_anchors(anchors, lens, still, still, np.eye(6), rules, n, 6.0)
     found = align_patches(anchors, rows, frame, lens, still, np.ones(n), 0, AlignRules())
     pose = np.ascontiguousarray(still.matrix()[:3])
     system = (
