@@ -55,7 +55,7 @@ def anchored(
         pixels=pixels,
         points_world=np.column_stack([ideal, np.ones(n)]) * depth_m,
         own=np.zeros((n, 3)),
-        marginals=np.tile([1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4], (n, 1)),
+        spread=np.tile([1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4], (n, 1)),
         texture=np.tile([4e4, 0.0, 4e4], (n, 1)),
         images=keyframe_images([image], [Pose.identity()]),
     )
@@ -180,10 +180,10 @@ def test_the_choice_is_spread_and_takes_the_surest() -> None:
     crowd = rng.uniform([20.0, 20.0], [310.0, 460.0], (1000, 2))
     few = rng.uniform([330.0, 20.0], [620.0, 460.0], (100, 2))
     anchors = anchored(painted(rng), np.concatenate([crowd, few]))
-    marginals = anchors.marginals.copy()
+    spread = anchors.spread.copy()
     vague = np.arange(1100) % 2 == 0
-    marginals[vague, 0] = marginals[vague, 3] = 0.04
-    anchors = replace(anchors, marginals=marginals)
+    spread[vague, 0] = spread[vague, 3] = 0.04
+    anchors = replace(anchors, spread=spread)
     chosen, radii, in_view = choose_anchors(
         anchors, lens_of(PINHOLE), Pose.identity(), Pose.identity(), 1e-4 * np.eye(6), RULES, 200, 6
     )

@@ -251,7 +251,7 @@ class _Tracker:
             found.ideal,
             found.slopes,
             self._anchors.points_world[found.anchors],
-            self._anchors.marginals[found.anchors],
+            self._anchors.spread[found.anchors],
             found.noise + found.misplaced,
         )
 

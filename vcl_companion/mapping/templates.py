@@ -41,9 +41,6 @@ _INCLINATION = 1.0
 # A point that projects farther than this from where it was seen is a wrong one.
 _MAX_REPROJECTION_PX = 2.0
 _CHI2_1_99 = 6.63
-# Keyframe poses of maps against truth had 2.7 to 4.5 times the variance that independent
-# pixel noise explains: what a detector misplaces is alike in neighbouring landmarks.
-_KEYFRAME_OPTIMISM = 4.0
 _RULES = AlignRules(max_iterations=12, least_score=0.8, max_moved_px=3.0)
 
 
@@ -53,7 +50,7 @@ class Templates:
 
     Attributes:
         anchors: landmarks in keyframes.
-        uncertainty: the map's joint covariance, its keyframes' part as large as it proved to be.
+        uncertainty: the map's joint covariance, as the features' pipeline has it.
     """
 
     anchors: Anchors
@@ -73,16 +70,8 @@ def prepare_templates(landmark_map: LandmarkMap, uncertainty: MapUncertainty) ->
     Raises:
         ValueError: an image cannot be decoded.
     """
-    uncertainty = replace(
-        uncertainty, keyframe_covariance=_KEYFRAME_OPTIMISM * uncertainty.keyframe_covariance
-    )
     images = [decode_image(k.image_bytes, k.camera) for k in landmark_map.keyframes]
     lenses = [lens_of(k.camera) for k in landmark_map.keyframes]
-    shared = (
-        uncertainty.landmark_lever
-        @ uncertainty.keyframe_covariance
-        @ np.swapaxes(uncertainty.landmark_lever, 1, 2)
-    )
     anchors, sigma = _anchored(landmark_map, uncertainty, images)
     frames = [pyramid_of(image) for image in images]
     good = np.ones(len(anchors.landmark), dtype=np.bool_)
@@ -93,9 +82,8 @@ def prepare_templates(landmark_map: LandmarkMap, uncertainty: MapUncertainty) ->
     anchors = _inclined(anchors, sigma)
     depth = 1.0 / anchors.planes[:, 2]
     own = _rays_world(anchors) * (sigma * depth**2)[:, None]
-    marginals = shared[anchors.landmark] + own[:, :, None] * own[:, None, :]
-    upper = np.triu_indices(3)
-    return Templates(replace(anchors, own=own, marginals=marginals[:, *upper]), uncertainty)
+    spread = (own[:, :, None] * own[:, None, :])[:, *np.triu_indices(3)]
+    return Templates(replace(anchors, own=own, spread=spread), uncertainty)
 
 
 def _anchored(
@@ -143,7 +131,7 @@ def _anchored(
         pixels=np.concatenate(pixels)[order],
         points_world=landmark_map.points_world[owner[order]],
         own=np.zeros((len(order), 3)),
-        marginals=np.zeros((len(order), 6)),
+        spread=np.zeros((len(order), 6)),
         texture=np.concatenate(texture)[order],
         images=table,
     )
@@ -176,7 +164,7 @@ def _only(anchors: Anchors, sigma: Array, kept: NDArray[np.bool_]) -> tuple[Anch
     first = np.searchsorted(landmark, np.arange(len(anchors.first))).astype(np.int64)
     parts = {
         name: getattr(anchors, name)[kept]
-        for name in ("keyframe", "planes", "pixels", "points_world", "own", "marginals", "texture")
+        for name in ("keyframe", "planes", "pixels", "points_world", "own", "spread", "texture")
     }
     return replace(anchors, first=first, landmark=landmark, **parts), sigma[kept]
 

@@ -182,7 +182,7 @@ def choose(
     first: Ints,
     keyframe: Ints,
     planes: Array,
-    marginals: Array,
+    spread: Array,
     texture: Array,
     lens: Array,
     reach: float,
@@ -208,7 +208,7 @@ def choose(
         lens: of the frame.
         reach: of that lens.
         transforms: to the frame, see the module.
-        marginals: (A, 6) xx xy xz yy yz zz of each anchor's point, world axes, m^2.
+        spread: (A, 6) xx xy xz yy yz zz of each anchor's own error, world axes, m^2.
         texture: (A, 3) xx, xy, yy of the summed squared gradient of its patch.
         cam_from_world: (3, 3) rotation.
         body_from_cam: (3, 4).
@@ -266,7 +266,7 @@ def choose(
         y0 = _across(j_cam[1], cam_from_world, 0)
         y1 = _across(j_cam[1], cam_from_world, 1)
         y2 = _across(j_cam[1], cam_from_world, 2)
-        m = marginals[best]
+        m = spread[best]
         mx0 = m[0] * x0 + m[1] * x1 + m[2] * x2
         mx1 = m[1] * x0 + m[3] * x1 + m[4] * x2
         mx2 = m[2] * x0 + m[4] * x1 + m[5] * x2
@@ -316,22 +316,19 @@ def choose(
         taken[cells[i]] += 1
     size = min(wanted, count)
     chosen, radii = np.empty(size, np.int64), np.empty(size)
-    filled, turn = 0, 0
-    while filled < size:
-        for i in order:
-            if rank[i] == turn and filled < size:
-                chosen[filled] = anchors[i]
-                spread = 0.0
-                for c in range(6):
-                    for d in range(6):
-                        spread += prior[c, d] * (
-                            jacobians[i, c] * jacobians[i, d]
-                            + jacobians[i, 6 + c] * jacobians[i, 6 + d]
-                        )
-                # The larger axis of the spread holds at most all of it.
-                radii[filled] = 3.0 * math.sqrt(max(spread, 0.0))
-                filled += 1
-        turn += 1
+    # The best of every cell first, then the second best...: a stable sort keeps their order.
+    turns = order[np.argsort(rank[order], kind="mergesort")]
+    for k in range(size):
+        i = turns[k]
+        chosen[k] = anchors[i]
+        apart = 0.0
+        for c in range(6):
+            for d in range(6):
+                apart += prior[c, d] * (
+                    jacobians[i, c] * jacobians[i, d] + jacobians[i, 6 + c] * jacobians[i, 6 + d]
+                )
+        # The larger axis of it holds at most all of it.
+        radii[k] = 3.0 * math.sqrt(max(apart, 0.0))
     return chosen, radii, count
 
 

@@ -111,7 +111,8 @@ class Anchors:
         pixels: (A, 2) the anchor in the keyframe's raw image.
         points_world: (A, 3) m.
         own: (A, 3) 1-sigma of its depth as a displacement of the point, world axes, m.
-        marginals: (A, 6) xx xy xz yy yz zz of the point's whole covariance, m^2.
+        spread: (A, 6) xx xy xz yy yz zz of the same, m^2. What all landmarks share through the
+            keyframes tells none of them from the others, and is not in it.
         texture: (A, 3) xx xy yy of the squared gradient summed over its patch.
         images: the keyframes.
     """
@@ -123,7 +124,7 @@ class Anchors:
     pixels: Array
     points_world: Array
     own: Array
-    marginals: Array
+    spread: Array
     texture: Array
     images: KeyframeImages
 
@@ -220,7 +221,7 @@ def choose_anchors(
         anchors.first,
         anchors.keyframe,
         anchors.planes,
-        anchors.marginals,
+        anchors.spread,
         anchors.texture,
         lens.table,
         lens.reach,

@@ -54,7 +54,7 @@ def _track(rng: np.random.Generator) -> None:
         pixels=pixels,
         points_world=np.column_stack([ideal, np.ones(n)]),
         own=np.zeros((n, 3)),
-        marginals=np.tile([1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6], (n, 1)),
+        spread=np.tile([1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6], (n, 1)),
         texture=np.tile([1e5, 0.0, 1e5], (n, 1)),
         images=keyframe_images([image], [still]),
     )
@@ -67,7 +67,7 @@ def _track(rng: np.random.Generator) -> None:
         found.ideal,
         found.slopes,
         anchors.points_world[rows],
-        anchors.marginals[rows],
+        anchors.spread[rows],
         found.noise + found.misplaced + np.array([1.0, 0.0, 1.0]),
     )
     pose_kernels.converged(pose, pose, *system, np.zeros((6, 6)), np.ones(1))
