@@ -13,6 +13,7 @@ from vcl_companion.errors import VclError
 
 _DEMO = Path(__file__).parent / "recordings" / "demo"
 _FOLDER = click.Path(path_type=Path)
+_PIPELINES = ("default", "paper")
 
 
 def _speed(_: click.Context, param: click.Parameter, value: str) -> float:
@@ -91,6 +92,11 @@ def main() -> None:
     metavar="SECTION.KEY=VALUE",
     help="More of the daemons' configuration, the value in TOML's notation (repeatable).",
 )
+@click.option(
+    "--pipeline",
+    type=click.Choice(_PIPELINES),
+    help="How daemons find their poses; the same as --set pipeline=...; default if not given.",
+)
 def fly(
     recording: Path,
     out: Path,
@@ -101,6 +107,7 @@ def fly(
     seed: int,
     start_timeout: float,
     settings: tuple[str, ...],
+    pipeline: str | None,
 ) -> None:
     """Fly RECORDING (a folder; the embedded demo by default) and report how it went.
 
@@ -111,7 +118,7 @@ def fly(
     from rich.console import Console
 
     from sitl.fly import fly as fly_recording
-    from sitl.plan import FlyOptions, parse_known_distance, parse_setting
+    from sitl.plan import FlyOptions, parse_known_distance, parse_setting, pipeline_setting
     from sitl.terminal import progress_shown, show_report
 
     options = FlyOptions(
@@ -120,7 +127,10 @@ def fly(
         known_distances=tuple(map(parse_known_distance, distances)),
         drones=tuple(name.strip() for name in drones.split(",") if name.strip()),
         start_timeout_s=start_timeout,
-        settings=tuple(map(parse_setting, settings)),
+        settings=(
+            *map(parse_setting, settings),
+            *([pipeline_setting(pipeline)] if pipeline else []),
+        ),
         seed=seed,
     )
     embedded = str(recording) == "demo" and not recording.exists()
@@ -190,6 +200,13 @@ def render(scenario: str, out: Path) -> None:
     metavar="SECTION.KEY=VALUE",
     help="More of the daemons' configuration in every flight (repeatable).",
 )
+@click.option(
+    "--pipeline",
+    "pipelines",
+    multiple=True,
+    type=click.Choice(_PIPELINES),
+    help="Only flown so (repeatable); otherwise both, side by side.",
+)
 def paper(
     out: Path,
     only: tuple[str, ...],
@@ -198,17 +215,19 @@ def paper(
     seconds: float | None,
     start_timeout: float,
     settings: tuple[str, ...],
+    pipelines: tuple[str, ...],
 ) -> None:
     """Fly the paper's experiments and lay them beside its figures: paper.html, paper.json.
 
-    Renders each scenario once and flies it with and without fusion where the paper
-    compares: about half an hour. What is finished and still fits is not made again,
+    Renders each scenario once and flies it by both pipelines, with and without fusion
+    where the paper compares: about an hour. What is finished and still fits is not made again,
     so the same command goes on after an interruption. Exit status: 0, whatever was
     measured; 2 for input that cannot be used, 1 when a flight broke off.
     """
     from rich.console import Console
 
     from sitl.paper import PaperOptions, make_paper
+    from sitl.paper_experiments import pipelines_named
     from sitl.plan import parse_setting
     from sitl.terminal import progress_shown, show_goals
 
@@ -224,7 +243,11 @@ def paper(
     try:
         with progress_shown(console) as progress:
             result = make_paper(
-                out, options, progress, lambda text: console.out(text, highlight=False)
+                out,
+                options,
+                progress,
+                lambda text: console.out(text, highlight=False),
+                pipelines=pipelines_named(pipelines),
             )
     except KeyboardInterrupt:
         click.echo("sitl: what is finished is kept; the same command goes on from here", err=True)

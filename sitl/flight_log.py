@@ -24,7 +24,8 @@ _Row = TypeVar("_Row", bound=msgspec.Struct)
 class FrameRow(msgspec.Struct, frozen=True):
     """What became of one frame, and how long it took from its arrival to that.
 
-    ``latency_ms`` is None for a frame that was never looked at.
+    ``latency_ms`` is None for a frame that was never looked at; ``by`` is what its own
+    pose rests on, "patches" or "features".
     """
 
     sequence: int
@@ -35,6 +36,7 @@ class FrameRow(msgspec.Struct, frozen=True):
     matched: int = 0
     inliers: int = 0
     source: Literal["intra", "inter", "fused"] | None = None
+    by: str | None = None
 
 
 class EstimateRow(msgspec.Struct, frozen=True):

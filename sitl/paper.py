@@ -158,7 +158,7 @@ def _fly(
     progress: Progress,
     say: Say,
 ) -> None:
-    name = f"{experiment.name}, {variant_name(fused)}"
+    name = f"{experiment.name}, {pipeline.name}, {variant_name(fused)}"
     folder = out / "flights" / _label(experiment, options)
     folder = folder / f"{pipeline.name}-{variant_name(fused)}"
     fly_options = FlyOptions(
@@ -172,7 +172,7 @@ def _fly(
             lambda stage, n, total: progress(f"{name}: {stage}", n, total),
         )  # fmt: skip
     except FlightError as error:
-        result.failures.append((f"{pipeline.name}: {name}", str(error)))
+        result.failures.append((name, str(error)))
         say(f"{name}: FAILED, {error}")
         return
     result.flights.setdefault(pipeline.name, {})[experiment.name, fused] = flight

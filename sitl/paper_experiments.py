@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sitl.plan import Setting
+from sitl.plan import Setting, pipeline_setting
 from vcl_companion.errors import ConfigError
 
 # Nobody asks anybody; the same daemons, maps and frames otherwise.
@@ -59,7 +59,10 @@ class Experiment:
         return (True, False) if self.compared else (True,)
 
 
-PIPELINES = (Pipeline("paper", "the paper's pipeline"),)
+PIPELINES = (
+    Pipeline("default", "the default pipeline"),
+    Pipeline("paper", "the paper's pipeline", (pipeline_setting("paper"),)),
+)
 
 _EVERY_IMAGE = Tuned(
     Setting(("inter", "every_n_frames"), 1),
@@ -129,6 +132,11 @@ def settings_of(
     """
     own = tuple(tuned.setting for tuned in experiment.tuned)
     return (*pipeline.settings, *own, *given, *(() if fused else (NOT_FUSED,)))
+
+
+def pipelines_named(names: tuple[str, ...]) -> tuple[Pipeline, ...]:
+    """Return the pipelines of these names, in their own order; all when none is named."""
+    return tuple(p for p in PIPELINES if not names or p.name in names)
 
 
 def chosen(experiments: tuple[Experiment, ...], only: tuple[str, ...]) -> tuple[Experiment, ...]:

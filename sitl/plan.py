@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from vcl_companion.config import Config
 from vcl_companion.errors import ConfigError
 from vcl_companion.recording import Drone, KnownPair, Recording
 
@@ -154,6 +155,17 @@ def parse_setting(text: str) -> Setting:
     if list(table) != ["value"]:
         raise ConfigError(f"--set {text}: {value!r} is no TOML value (a string needs quotes)")
     return Setting(path, table["value"])
+
+
+def pipeline_setting(name: str) -> Setting:
+    """Return the setting that has daemons find their poses so: ``default`` or ``paper``."""
+    return Setting(("pipeline",), name)
+
+
+def pipeline_of(settings: Sequence[Setting]) -> object:
+    """Return which pipeline settings ask for: the last of them, else the daemons' own default."""
+    asked = [setting.value for setting in settings if setting.path == ("pipeline",)]
+    return asked[-1] if asked else Config().pipeline
 
 
 def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:

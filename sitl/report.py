@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from sitl.plan import pipeline_of
 from sitl.report_page import page
 from sitl.result import DroneResult, FlightResult
 
@@ -65,7 +66,7 @@ def report_of(result: FlightResult) -> dict[str, Any]:
     options = plan.options
     report = {
         "recording": plan.recording.name,
-        "pipeline": "default",
+        "pipeline": pipeline_of(options.settings),
         "options": {
             "speed": "max" if math.isinf(options.speed) else options.speed,
             "drones": [drone.name for drone in plan.drones],

@@ -23,7 +23,9 @@ from vcl_companion.errors import ConfigError
 from vcl_companion.links.autopilot import AutopilotOptions
 from vcl_companion.links.peers import PeerOptions
 from vcl_companion.localization.intra import LocalizationOptions
+from vcl_companion.localization.pipeline import Pipeline
 from vcl_companion.localization.pose_filter import FilterOptions
+from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.swarm.group import SwarmOptions
 from vcl_companion.swarm.pose_requests import InterMavOptions
@@ -58,10 +60,13 @@ class Config:
     Attributes:
         system_id: this drone's MAVLink system id, 1..255.
         clock: ``system`` in flight; ``camera`` when a stream or a recording is the time.
+        pipeline: ``default`` tracks the map's patches and looks for features only when
+            lost; ``paper`` looks for features in every frame.
     """
 
     system_id: int = 1
     clock: Literal["system", "camera"] = "system"
+    pipeline: Pipeline = "default"
     camera: CameraOptions = field(default_factory=CameraOptions)
     autopilot: AutopilotOptions = field(default_factory=AutopilotOptions)
     peers: PeerOptions = field(default_factory=PeerOptions)
@@ -71,6 +76,7 @@ class Config:
     update: UpdateOptions = field(default_factory=UpdateOptions)
     features: FeatureOptions = field(default_factory=FeatureOptions)
     localization: LocalizationOptions = field(default_factory=LocalizationOptions)
+    tracking: TrackingOptions = field(default_factory=TrackingOptions)
     filter: FilterOptions = field(default_factory=FilterOptions)
     inter: InterMavOptions = field(default_factory=InterMavOptions)
     log: LogOptions = field(default_factory=LogOptions)

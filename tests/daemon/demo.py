@@ -20,6 +20,7 @@ from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.mapping.drone_view import encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.reconstruction import MapOptions
+from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.recording import Recording, read_recording
 from vcl_companion.recording.images import load_image
 from vcl_companion.recording.sensor import Sensor
@@ -133,6 +134,12 @@ def update_index() -> MapIndex:
 @functools.cache
 def map_index(*system_ids: int) -> MapIndex:
     return index_map(decode_map(encoded_map(*system_ids)), "akaze", FEATURES)
+
+
+@functools.cache
+def templates(*system_ids: int) -> Templates:
+    index = map_index(*system_ids)
+    return prepare_templates(index.landmark_map, index.uncertainty)
 
 
 def world_from_body(system_id: int, k: int) -> Pose:

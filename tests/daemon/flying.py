@@ -12,10 +12,12 @@ from tests.daemon import demo
 from tests.daemon.swarm import Drone
 from tests.daemon.waiting import beside
 from vcl_companion.cameras.stream import StreamCamera
-from vcl_companion.daemon.companion import Companion, CompanionOptions
+from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.localization.intra import LocalizationOptions
+from vcl_companion.localization.pipeline import PipelineOptions
+from vcl_companion.localization.tracking import TrackingOptions
 
 # More landmarks than any picture has: it cannot localize itself, whatever it sees.
 STARVED = LocalizationOptions(min_inliers=10_000)
@@ -45,7 +47,9 @@ async def flying(
     drone: Drone, localization: LocalizationOptions | None = None
 ) -> AsyncIterator[Flier]:
     """Fly a drone that was started; ``STARVED`` for one that sees too little."""
-    options = CompanionOptions(demo.FEATURES, localization or LocalizationOptions())
+    options = PipelineOptions(
+        demo.FEATURES, localization or LocalizationOptions(), TrackingOptions()
+    )
     sensor = demo.sensor(drone.system_id)
     size_px = (sensor.camera.width_px, sensor.camera.height_px)
     async with contextlib.AsyncExitStack() as stack:

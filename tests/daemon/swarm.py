@@ -20,7 +20,7 @@ from tests.daemon.waiting import beside, until
 from vcl_companion.cameras.source import Frame
 from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import ManualClock
-from vcl_companion.daemon.companion import Companion, CompanionOptions
+from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.exchange import Exchange, ExchangeOptions
 from vcl_companion.daemon.flight_log import FlightLog
@@ -32,7 +32,9 @@ from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.mavlink import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions
 from vcl_companion.localization.intra import LocalizationOptions, Localized
+from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.pose_filter import FilterOptions
+from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.swarm.transfer import (
@@ -104,7 +106,10 @@ class Drone:
             system_id, self.group, Transfers(transfer, rng), self.maps,
             self.autopilot_link, demo.sensor(system_id), clock, self.log, executor,
             self.estimator,
-            ExchangeOptions(swarm, demo.MAP_OPTIONS, update, demo.FEATURES, "akaze", inter), rng,
+            ExchangeOptions(
+                swarm, demo.MAP_OPTIONS, update, demo.FEATURES, "akaze", inter, tracked=False
+            ),
+            rng,
         )  # fmt: skip
         self._link = PeerLink(
             peers, system_id, frozenset(members), self._hear, self.exchange.on_heartbeat
@@ -129,6 +134,7 @@ class Drone:
         fix = Localized(
             Pose.identity(), 1e-4 * np.eye(6), 1e-4 * np.eye(6), np.zeros((6, 0)),
             np.zeros((0, 0)), n_landmarks, n_landmarks, False, 0.5,
+            n_seen=n_landmarks, covered=1.0,
         )  # fmt: skip
         self.estimator.take_fix(predicted, fix, at_ns, None)
 
@@ -181,7 +187,7 @@ class Flyer(Drone):
                 source, FrameOutcomes(source, self.clock, health, self.log), sensor,
                 self.autopilot_link, self.maps, self.estimator, self.exchange.inter,
                 self.exchange.on_frame, health, self.log, executor,
-                CompanionOptions(demo.FEATURES, LocalizationOptions()),
+                PipelineOptions(demo.FEATURES, LocalizationOptions(), TrackingOptions()),
             )  # fmt: skip
             try:
                 async with asyncio.TaskGroup() as parts:
@@ -341,7 +347,11 @@ class Swarm:
         )  # fmt: skip
         life.callback(drone.close)
         if flies_on:
-            drone.maps.replace(demo.encoded_map(*flies_on), demo.map_index(*flies_on))
+            drone.maps.replace(
+                demo.encoded_map(*flies_on),
+                demo.map_index(*flies_on),
+                templates=demo.templates(*flies_on),
+            )
         if runs:
             await life.enter_async_context(beside(drone.run()))
             await drone.autopilot.states.get()

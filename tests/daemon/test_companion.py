@@ -20,7 +20,7 @@ from tests.daemon.autopilot import Autopilot, autopilot_and_link
 from tests.daemon.waiting import beside, run, until
 from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import ManualClock
-from vcl_companion.daemon.companion import Companion, CompanionOptions
+from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_history import FrameHistory
@@ -31,12 +31,14 @@ from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.geometry.rotation import matrix_from_euler, quaternion_from_matrix
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.localization.intra import LocalizationOptions
+from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.pose_filter import FilterOptions
+from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
 
 DRONE = 2
-OPTIONS = CompanionOptions(demo.FEATURES, LocalizationOptions())
+OPTIONS = PipelineOptions(demo.FEATURES, LocalizationOptions(), TrackingOptions())
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +69,9 @@ class Flight:
         return self.estimator.is_localized(self.clock.now_ns())
 
     def fly_on_a_map(self) -> None:
-        self.maps.replace(demo.encoded_map(1, 2, 3), demo.map_index(1, 2, 3))
+        ids = (1, 2, 3)
+        patches = demo.templates(*ids)
+        self.maps.replace(demo.encoded_map(*ids), demo.map_index(*ids), templates=patches)
 
     def end_stream(self, k: int) -> None:
         self.server.say_end(demo.shot(DRONE, k).at_ns)

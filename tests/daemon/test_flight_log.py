@@ -27,7 +27,8 @@ SUMMARY = {
 
 
 def fill(log: FlightLog) -> None:
-    log.frame(0, 100, "localized", latency_ms=12.5, matched=40, inliers=30, source="fused")
+    log.frame(0, 100, "localized", latency_ms=12.5, matched=40, inliers=30, source="fused",
+              by="patches")  # fmt: skip
     log.frame(1, 200, "refused", reason="fog", latency_ms=8.0, matched=3)
     log.frame(2, 300, "dropped")
     log.frame(3, 400, "refused", reason="fog", latency_ms=9.0)
@@ -50,13 +51,17 @@ def test_lines_are_as_specified(tmp_path: Path) -> None:
     log.close(**SUMMARY)
     assert lines(path)[:-1] == before_the_end == [
         {"kind": "frame", "sequence": 0, "captured_at_ns": 100, "outcome": "localized",
-         "reason": None, "latency_ms": 12.5, "matched": 40, "inliers": 30, "source": "fused"},
+         "reason": None, "latency_ms": 12.5, "matched": 40, "inliers": 30, "source": "fused",
+         "by": "patches"},
         {"kind": "frame", "sequence": 1, "captured_at_ns": 200, "outcome": "refused",
-         "reason": "fog", "latency_ms": 8.0, "matched": 3, "inliers": 0, "source": None},
+         "reason": "fog", "latency_ms": 8.0, "matched": 3, "inliers": 0, "source": None,
+         "by": None},
         {"kind": "frame", "sequence": 2, "captured_at_ns": 300, "outcome": "dropped",
-         "reason": None, "latency_ms": None, "matched": 0, "inliers": 0, "source": None},
+         "reason": None, "latency_ms": None, "matched": 0, "inliers": 0, "source": None,
+         "by": None},
         {"kind": "frame", "sequence": 3, "captured_at_ns": 400, "outcome": "refused",
-         "reason": "fog", "latency_ms": 9.0, "matched": 0, "inliers": 0, "source": None},
+         "reason": "fog", "latency_ms": 9.0, "matched": 0, "inliers": 0, "source": None,
+         "by": None},
         {"kind": "event", "at_ns": 42, "event": "lost", "reason": "fog \u2601"},
         {"kind": "map", "at_ns": 42, "revision": "0001020304050607", "parent": "",
          "landmarks": 120, "bytes": 4567, "keyframes": 3},

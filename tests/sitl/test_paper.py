@@ -29,6 +29,7 @@ from sitl.paper_experiments import (
     TABLE_I,
     Experiment,
     Pipeline,
+    pipelines_named,
     settings_of,
 )
 from sitl.paper_figures import rotate_svg, sparse_svg
@@ -38,7 +39,7 @@ from sitl.paper_goals import Goal, goals
 from sitl.paper_measures import compared, flight_measures, path_length_m
 from sitl.paper_page import page
 from sitl.paper_recordings import Rendered, rendered
-from sitl.plan import FlyOptions, Setting
+from sitl.plan import FlyOptions, Setting, pipeline_of
 from sitl.processes import FlightError
 from sitl.report import report_of
 from sitl.result import gather
@@ -277,7 +278,7 @@ def test_the_page_has_table_one_with_a_column_for_each_pipeline(tmp_path: Path) 
     assert f"<td>2.5 (3.6)</td><td>{x_cm:.1f} ({x_cm:.1f})</td>" in html
     assert f"<td>23.9 (35.2)</td><td>{y_cm:.1f} ({y_cm:.1f})</td>" in html
     assert "24.0 (35.5)" in html
-    assert set(paper["pipelines"]) == {"paper", "other"}
+    assert set(paper["pipelines"]) == {"default", "other"}
     assert paper["table_1_of_the_paper"]["mav2"]["fused_cm"] == list(TABLE_I["mav2"].fused_cm)
     for figure in ("Fig. 5", "Fig. 7", "Fig. 8", "Fig. 9", "Fig. 10", "Fig. 12"):
         assert figure in html
@@ -324,6 +325,14 @@ def test_a_flight_that_fits_is_taken_and_not_flown(tmp_path: Path) -> None:
     assert again.reused
     assert told == ["comparing with the truth"]
     assert flight_measures(again) == flight_measures(before)
+
+
+def test_the_pipelines_are_flown_side_by_side_and_differ_in_one_setting() -> None:
+    rotate = EXPERIMENT["rotate"]
+    asked = {p.name: pipeline_of(settings_of(rotate, p, True, ())) for p in PIPELINES}
+    assert asked == {"default": "default", "paper": "paper"}
+    assert [p.name for p in pipelines_named(("paper",))] == ["paper"]
+    assert pipelines_named(()) == PIPELINES
 
 
 @pytest.mark.parametrize("changed", ["recording", "settings", "speed", "seed", "code", "libraries"])

@@ -15,6 +15,7 @@ TIMEOUT_S = 240.0
 
 def command(out: Path) -> list[str]:
     arguments = ["--out", str(out), "--only", "rotate", "--seconds", "0.4"]
+    arguments += ["--pipeline", "default"]
     return [sys.executable, "-m", "sitl", "paper", *arguments]
 
 
@@ -38,7 +39,7 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path) -> None:
             told = []
             for line in iter(run.stdout.readline, ""):
                 told.append(line)
-                if line.startswith("rotate, unfused: making the first map"):
+                if line.startswith("rotate, default, unfused: making the first map"):
                     break
             run.send_signal(signal.SIGINT)
             _, errors = run.communicate(timeout=TIMEOUT_S)
@@ -47,7 +48,7 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path) -> None:
     assert run.returncode == 130, errors
     assert "the same command goes on from here" in errors
     assert "Traceback" not in errors
-    assert any(line.startswith("rotate, fused: flown") for line in told)
+    assert any(line.startswith("rotate, default, fused: flown") for line in told)
     assert not (out / "paper.json").exists()
 
     done = subprocess.run(
@@ -56,14 +57,14 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert "rotate: recording reused" in done.stdout
-    assert "rotate, fused: flight reused" in done.stdout
-    assert "rotate, unfused: flown, " in done.stdout
+    assert "rotate, default, fused: flight reused" in done.stdout
+    assert "rotate, default, unfused: flown, " in done.stdout
     assert str(out / "paper.html") in done.stdout.replace("\n", "")
 
     paper = json.loads((out / "paper.json").read_text())
     assert paper["failures"] == []
     assert paper["whole"] is False
-    told_of = paper["pipelines"]["paper"]
+    told_of = paper["pipelines"]["default"]
     # Two images of each drone prove that it runs, and nothing else.
     assert {goal["verdict"] for goal in told_of["must_show"]} == {"not judged"}
     rotate = told_of["experiments"]["rotate"]

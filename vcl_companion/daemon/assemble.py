@@ -18,7 +18,7 @@ from vcl_companion.cameras.open import open_camera
 from vcl_companion.clock import Clock, ManualClock, SystemClock
 from vcl_companion.config import Config
 from vcl_companion.daemon import notify
-from vcl_companion.daemon.companion import Companion, CompanionOptions
+from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.exchange import Exchange, ExchangeOptions
 from vcl_companion.daemon.flight_log import FlightLog
@@ -29,6 +29,7 @@ from vcl_companion.daemon.worker import Worker
 from vcl_companion.errors import VclError
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.peers import PeerLink
+from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.recording.sensor import read_sensor
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.transfer import Transfers
@@ -116,6 +117,7 @@ async def _run(config: Config) -> int:
             config.features,
             config.localization.detector,
             config.inter,
+            tracked=config.pipeline == "default",
         ),
         rng,
     )
@@ -131,7 +133,7 @@ async def _run(config: Config) -> int:
         health,
         log,
         vision,
-        CompanionOptions(config.features, config.localization),
+        PipelineOptions(config.features, config.localization, config.tracking),
     )
     peers = PeerLink(
         config.peers,

@@ -7,7 +7,6 @@ import logging
 import math
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass
 
 from vcl_companion.cameras.source import CameraSource, Frame
 from vcl_companion.daemon.estimator import Estimator
@@ -19,15 +18,10 @@ from vcl_companion.daemon.mailbox import Mailbox
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot import AutopilotLink
-from vcl_companion.localization.intra import (
-    LocalizationOptions,
-    Localized,
-    NotLocalized,
-    localize_intra,
-)
+from vcl_companion.localization.intra import Localized, NotLocalized, Recognised
+from vcl_companion.localization.pipeline import PipelineOptions, localize
 from vcl_companion.localization.pose_filter import FilterState, NotFused
 from vcl_companion.recording.sensor import Sensor
-from vcl_companion.vision.features import FeatureOptions, detect
 from vcl_companion.wire.pose_messages import PoseProposal
 
 _log = logging.getLogger(__name__)
@@ -36,14 +30,6 @@ _log = logging.getLogger(__name__)
 ATTITUDE_WAIT_S = 0.1
 # How long the last frames of a stream may take.
 _LAST_FRAMES_S = 5.0
-
-
-@dataclass(frozen=True)
-class CompanionOptions:
-    """What the steps of the line are tuned by; see each of them."""
-
-    features: FeatureOptions
-    localization: LocalizationOptions
 
 
 class Companion:
@@ -77,7 +63,7 @@ class Companion:
         health: Health,
         log: FlightLog,
         executor: Executor,
-        options: CompanionOptions,
+        options: PipelineOptions,
     ) -> None:
         self._camera = camera
         self._outcomes = outcomes
@@ -150,25 +136,21 @@ class Companion:
             The request to peers, and why the frame itself gave no pose; None
             when nobody is asked and the frame is answered.
         """
-        loop = asyncio.get_running_loop()
         at_ns = frame.captured_at_ns
-        attitude_soon = asyncio.ensure_future(self._autopilot.attitude_at(at_ns, ATTITUDE_WAIT_S))
-        features = await loop.run_in_executor(
-            self._executor, detect, frame.image, stored.index.detector, self._options.features
-        )
-        attitude = await attitude_soon
+        attitude = await self._autopilot.attitude_at(at_ns, ATTITUDE_WAIT_S)
         ned_from_body = None if attitude is None else attitude.ned_from_body
         predicted = self._estimator.predicted(at_ns, ned_from_body)
-        fix = await loop.run_in_executor(
+        fix = await asyncio.get_running_loop().run_in_executor(
             self._executor,
-            localize_intra,
-            features,
+            localize,
+            frame.image,
             self._sensor.camera,
             self._sensor.body_from_cam,
             stored.index,
+            stored.templates,
             predicted.prior() if predicted else None,
             ned_from_body,
-            self._options.localization,
+            self._options,
         )
         refused = self._take(frame, fix, ned_from_body)
         sigma_m = math.inf if refused else self._estimator.sigma_m
@@ -202,7 +184,7 @@ class Companion:
         )
         if isinstance(state, NotLocalized):
             return state
-        return self._send(frame, state, "intra", fix.n_matched, fix.n_inliers)
+        return self._send(frame, state, "intra", fix.n_matched, fix.n_inliers, fix.by)
 
     async def _hear_peers(
         self, asked: Asked, stored: StoredMap, refused: NotLocalized | None
@@ -244,6 +226,7 @@ class Companion:
         source: PoseSource,
         n_matched: int = 0,
         n_inliers: int = 0,
+        by: Recognised | None = None,
     ) -> NotLocalized | None:
         """Send the pose of a frame, at its own time; or say why it cannot be."""
         sent = self._autopilot.send_pose(
@@ -254,7 +237,7 @@ class Companion:
         )
         if not sent:
             return NotLocalized("the pose's covariance is not finite", n_matched, n_inliers)
-        self._outcomes.sent(frame, source, n_matched, n_inliers)
+        self._outcomes.sent(frame, source, n_matched, n_inliers, by)
         return None
 
     def _drop(self, frame: Frame) -> None:

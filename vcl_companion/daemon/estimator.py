@@ -63,7 +63,9 @@ class Estimator:
         self._looked = asyncio.Event()
         self.n_resets = 0
         self.tracked = 0
-        """Landmarks that agreed in the last frame; 0 when it was refused."""
+        """Landmarks of the map that the last frame showed; 0 when it was refused."""
+        self.covered = 0.0
+        """Share of the last frame that they filled; 0 when it was refused."""
 
     def is_localized(self, now_ns: int) -> bool:
         """Whether a frame of the last two seconds gave a pose, by a fix or by a proposal."""
@@ -102,7 +104,7 @@ class Estimator:
         self, predicted: FilterState | None, at_ns: int, ned_from_body: Array | None
     ) -> None:
         """Note a frame without a fix: a proposal may still come for its instant."""
-        self.tracked = 0
+        self.tracked, self.covered = 0, 0.0
         if predicted is not None:
             self._history.append(predicted, None, ned_from_body)
         self._note(at_ns)
@@ -140,7 +142,7 @@ class Estimator:
             self._jump(f"relocalized with {fix.n_inliers} landmarks")
         self._n_contradicted = 0
         self._has_begun = True
-        self.tracked = fix.n_inliers
+        self.tracked, self.covered = fix.n_seen, fix.covered
         self._history.append(state, fix, ned_from_body)
         self._note(at_ns)
         return state

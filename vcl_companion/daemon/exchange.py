@@ -63,7 +63,7 @@ _STEP_S = 0.1
 
 @dataclass(frozen=True)
 class ExchangeOptions:
-    """What the exchange is tuned by; see each of them."""
+    """What the exchange is tuned by; see each of them. ``tracked``: maps by their patches."""
 
     swarm: SwarmOptions
     map: MapOptions
@@ -71,6 +71,7 @@ class ExchangeOptions:
     features: FeatureOptions
     detector: Detector
     inter: InterMavOptions
+    tracked: bool
 
 
 class Exchange:
@@ -157,6 +158,7 @@ class Exchange:
             options.features,
             memory,
             options.update.delivery_wait_s,
+            options.tracked,
         )
         self.inter = InterTarget(
             system_id,

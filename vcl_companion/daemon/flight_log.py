@@ -16,6 +16,7 @@ from vcl_companion.clock import Clock
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.pose import Pose, euler_pose_covariance
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.localization.intra import Recognised
 
 _log = logging.getLogger(__name__)
 
@@ -63,8 +64,9 @@ class FlightLog:
         matched: int = 0,
         inliers: int = 0,
         source: PoseSource | None = None,
+        by: Recognised | None = None,
     ) -> None:
-        """Write what became of a frame."""
+        """Write what became of a frame; ``by``: what its own pose rests on, if it has one."""
         self.frames[outcome] += 1
         if outcome == "refused":
             known = reason in self.refusals or len(self.refusals) < _MAX_REASONS
@@ -79,6 +81,7 @@ class FlightLog:
             matched=matched,
             inliers=inliers,
             source=source,
+            by=by,
         )
 
     def estimate(

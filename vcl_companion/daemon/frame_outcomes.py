@@ -12,7 +12,7 @@ from vcl_companion.cameras.source import CameraSource, Frame, Outcome
 from vcl_companion.clock import Clock, ManualClock
 from vcl_companion.daemon.flight_log import FlightLog, PoseSource
 from vcl_companion.daemon.health import Health
-from vcl_companion.localization.intra import NotLocalized
+from vcl_companion.localization.intra import NotLocalized, Recognised
 
 _log = logging.getLogger(__name__)
 
@@ -25,6 +25,7 @@ class _Sent:
     n_matched: int
     n_inliers: int
     source: PoseSource
+    by: Recognised | None
 
 
 class FrameOutcomes:
@@ -55,11 +56,17 @@ class FrameOutcomes:
         self._open.append(frame)
 
     def sent(
-        self, frame: Frame, source: PoseSource, n_matched: int = 0, n_inliers: int = 0
+        self,
+        frame: Frame,
+        source: PoseSource,
+        n_matched: int = 0,
+        n_inliers: int = 0,
+        by: Recognised | None = None,
     ) -> None:
         """Note that a frame's pose is with the autopilot; ``close`` answers the frame."""
         self._health.localized()
-        self._sent[frame.sequence] = _Sent(self._latency_ms(frame), n_matched, n_inliers, source)
+        latency_ms = self._latency_ms(frame)
+        self._sent[frame.sequence] = _Sent(latency_ms, n_matched, n_inliers, source, by)
 
     def close(self, frame: Frame, source: PoseSource | None = None) -> None:
         """Answer a frame whose pose was sent; ``source`` when it is another one by now."""
@@ -72,6 +79,7 @@ class FrameOutcomes:
             matched=sent.n_matched,
             inliers=sent.n_inliers,
             source=source or sent.source,
+            by=sent.by,
         )
         self._answer(frame, "localized")
 

@@ -8,6 +8,7 @@ from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.mapping.landmark_map import Keyframe
+from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.vision.features import Detector, FeatureOptions, Features
 from vcl_companion.wire.header import BlobKind
 from vcl_companion.wire.map_codec import decode_map, parent_of, revision_of
@@ -49,6 +50,7 @@ class ReadyMap:
     data: bytes
     index: MapIndex
     update: bytes
+    templates: Templates | None
 
 
 def ready_map(
@@ -57,8 +59,9 @@ def ready_map(
     detector: Detector,
     features: FeatureOptions,
     memory: FeatureMemory,
+    tracked: bool,
 ) -> ReadyMap:
-    """Decode and index; takes a second, beside the event loop.
+    """Decode, index and cut patches; takes a second, beside the event loop and the frames.
 
     Args:
         offer: what came or was made.
@@ -66,6 +69,7 @@ def ready_map(
         detector: the localization's own.
         features: how they are found.
         memory: finds them.
+        tracked: whether the map is also made ready to be tracked.
 
     Raises:
         WireError: the bytes are no map, or need a parent that is not in use here.
@@ -86,4 +90,5 @@ def ready_map(
     index = index_map(decode_map(data), detector, features, features_of)
     if parent is not None and not update:
         update = encode_map_update(data, parent)
-    return ReadyMap(data, index, update)
+    templates = prepare_templates(index.landmark_map, index.uncertainty) if tracked else None
+    return ReadyMap(data, index, update, templates)

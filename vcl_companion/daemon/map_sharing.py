@@ -64,6 +64,7 @@ class MapSharing:
         memory: finds them; only the executor's thread uses it.
         delivery_wait_s: how long a coordinator that is back with a map which we
             have left may take to be brought up to date; then it has its way.
+        tracked: whether maps are made ready to be tracked by their patches.
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class MapSharing:
         features: FeatureOptions,
         memory: FeatureMemory,
         delivery_wait_s: float,
+        tracked: bool,
     ) -> None:
         self._group = group
         self._transfers = transfers
@@ -91,6 +93,7 @@ class MapSharing:
         self._features = features
         self._memory = memory
         self._delivery_wait_s = delivery_wait_s
+        self._tracked = tracked
         self._offered: PeerMailbox[MapOffer] = PeerMailbox()
         self._handed: dict[int, _Handed] = {}
         self._behind_since_s: float | None = None  # the coordinator, as far as known
@@ -248,6 +251,7 @@ class MapSharing:
                 self._detector,
                 self._features,
                 self._memory,
+                self._tracked,
             )
         except (WireError, ValueError) as error:
             return NoMap(str(error))
@@ -257,7 +261,7 @@ class MapSharing:
             return NoMap(f"using it failed: {type(error).__name__}")
 
     async def _install(self, ready: ReadyMap) -> None:
-        stored = self._maps.replace(ready.data, ready.index, ready.update)
+        stored = self._maps.replace(ready.data, ready.index, ready.update, ready.templates)
         n_keyframes = len(ready.index.landmark_map.keyframes)
         n_bytes = len(ready.data)
         self._log.map(stored.revision, stored.parent, stored.n_landmarks, n_bytes, n_keyframes)

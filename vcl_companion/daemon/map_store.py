@@ -13,6 +13,7 @@ from pathlib import Path
 
 from vcl_companion.errors import ConfigError
 from vcl_companion.localization.map_index import MapIndex
+from vcl_companion.mapping.templates import Templates
 from vcl_companion.wire.map_codec import revision_of
 
 _log = logging.getLogger(__name__)
@@ -27,15 +28,17 @@ class StoredMap:
     Attributes:
         revision: its content hash.
         data: its encoded form, as handed on to peers.
-        index: ready for localization.
+        index: ready to be recognised.
         update: the same for one who has its parent (``map_update``); empty when
             we do not have that ourselves.
+        templates: ready to be tracked; None when it is not to be.
     """
 
     revision: bytes
     data: bytes
     index: MapIndex
     update: bytes = b""
+    templates: Templates | None = None
 
     @property
     def parent(self) -> bytes:
@@ -77,9 +80,15 @@ class MapStore:
                 why = getattr(error, "strerror", None) or error
                 raise ConfigError(f"[map] directory {directory!r}: {why}") from error
 
-    def replace(self, data: bytes, index: MapIndex, update: bytes = b"") -> StoredMap:
+    def replace(
+        self,
+        data: bytes,
+        index: MapIndex,
+        update: bytes = b"",
+        templates: Templates | None = None,
+    ) -> StoredMap:
         """Fly on this map from the next frame on."""
-        stored = StoredMap(revision_of(data), data, index, update)
+        stored = StoredMap(revision_of(data), data, index, update, templates)
         if self.current is not None and self.current.revision != stored.revision:
             self._left.append(self.current.revision)
         self.current = stored

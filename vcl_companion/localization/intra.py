@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, euler_from_matrix
+from vcl_companion.localization.coverage import covered_share
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.vision.features import Detector, Features
 from vcl_companion.vision.matching import MatchOptions, match_guided, match_to_entries
@@ -21,6 +23,9 @@ from vcl_companion.vision.resection import (
     refine,
     search,
 )
+
+Recognised = Literal["patches", "features"]
+"""What a pose rests on: the map's patches, or a detector's features."""
 
 _SURE_PX = 8.0
 # One landmark may decide this much of a pose that a prediction led to, and of one found without:
@@ -94,6 +99,9 @@ class Localized:
         n_inliers: of these, how many agree.
         guided: whether the prediction led the matching.
         rms_px: of the inliers.
+        n_seen: landmarks of the map that this image shows, as far as can be told.
+        covered: share of the image that they fill, 0 to 1.
+        by: what was recognised.
     """
 
     world_from_body: Pose
@@ -105,6 +113,9 @@ class Localized:
     n_inliers: int
     guided: bool
     rms_px: float
+    n_seen: int = 0
+    covered: float = 0.0
+    by: Recognised = "features"
 
     def covariance(self) -> Array:
         """Return (6, 6) the whole covariance of this pose alone, local."""
@@ -119,6 +130,28 @@ class NotLocalized:
     reason: str
     n_matched: int = 0
     n_inliers: int = 0
+
+
+def believed(
+    fix: Localized, ned_from_body: Array | None, options: LocalizationOptions
+) -> Localized | NotLocalized:
+    """Return a pose only when it is certain enough and upright enough, else why not."""
+    n_matched, n_inliers = fix.n_matched, fix.n_inliers
+    covariance = fix.covariance()
+    if not np.all(np.isfinite(covariance)):
+        return NotLocalized("the landmarks found do not fix a pose", n_matched, n_inliers)
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+    if sigma > options.max_sigma_m:
+        return NotLocalized(
+            f"too uncertain: {sigma:.1f} m, {options.max_sigma_m:.1f} m allowed",
+            n_matched,
+            n_inliers,
+        )
+    if ned_from_body is not None:
+        reason = disagreement(fix.world_from_body.rotation, ned_from_body, options)
+        if reason:
+            return NotLocalized(reason, n_matched, n_inliers)
+    return fix
 
 
 def disagreement(world_from_body: Array, ned_from_body: Array, options: LocalizationOptions) -> str:
@@ -144,7 +177,7 @@ class _Matched:
     """One attempt: the matches it made, and what came of them."""
 
     landmarks: NDArray[np.intp]
-    sightings: Sightings
+    pixels: Array
     result: Resection | NotFound
 
 
@@ -245,7 +278,7 @@ class _Matcher:
         start: Pose | NotFound = world_from_body
         if radius_px > _SURE_PX:
             start = search(sightings, self._resection_options(max_leverage))
-        return self._refined(start, landmarks, sightings, max_leverage)
+        return self._refined(start, found, landmarks, sightings, max_leverage)
 
     def whole_map(self) -> _Matched:
         """Match against every landmark, then search the pose among the matches."""
@@ -254,12 +287,12 @@ class _Matcher:
         )
         sightings = self._sightings(found, landmarks, None)
         start = search(sightings, self._resection_options(_FOUND_LEVERAGE))
-        return self._refined(start, landmarks, sightings, _FOUND_LEVERAGE)
+        return self._refined(start, found, landmarks, sightings, _FOUND_LEVERAGE)
 
     def judged(
         self, attempt: _Matched, guided: bool, ned_from_body: Array | None
     ) -> Localized | NotLocalized:
-        """Believe the pose only when it is certain enough and upright enough."""
+        """Say how certain the pose is, and whether it is believed."""
         result = attempt.result
         n_matched = len(attempt.landmarks)
         if isinstance(result, NotFound):
@@ -274,22 +307,10 @@ class _Matcher:
             n_inliers,
             guided,
             result.rms_px,
+            n_inliers,
+            covered_share(attempt.pixels[result.inliers], self.camera),
         )
-        covariance = fix.covariance()
-        if not np.all(np.isfinite(covariance)):
-            return NotLocalized("the matched landmarks do not fix a pose", n_matched, n_inliers)
-        sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-        if sigma > self.options.max_sigma_m:
-            return NotLocalized(
-                f"too uncertain: {sigma:.1f} m, {self.options.max_sigma_m:.1f} m allowed",
-                n_matched,
-                n_inliers,
-            )
-        if ned_from_body is not None:
-            reason = disagreement(result.world_from_body.rotation, ned_from_body, self.options)
-            if reason:
-                return NotLocalized(reason, n_matched, n_inliers)
-        return fix
+        return believed(fix, ned_from_body, self.options)
 
     def _map_error(self, result: Resection, landmarks: NDArray[np.intp]) -> tuple[Array, Array]:
         """Return the pose's (6, 6) covariance by the landmarks' own errors, and its map lever."""
@@ -353,11 +374,13 @@ class _Matcher:
     def _refined(
         self,
         start: Pose | NotFound,
+        found: NDArray[np.intp],
         landmarks: NDArray[np.intp],
         sightings: Sightings,
         max_leverage: float,
     ) -> _Matched:
+        pixels = self.features.pixels[found]
         if isinstance(start, NotFound):
-            return _Matched(landmarks, sightings, start)
+            return _Matched(landmarks, pixels, start)
         result = refine(start, sightings, self._resection_options(max_leverage))
-        return _Matched(landmarks, sightings, result)
+        return _Matched(landmarks, pixels, result)

@@ -8,13 +8,26 @@ from __future__ import annotations
 
 import numpy as np
 
+from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.vision import pose_kernels
 from vcl_companion.vision.absolute_pose import resect
+from vcl_companion.vision.patches import (
+    AlignRules,
+    Anchors,
+    ChoiceRules,
+    align_patches,
+    choose_anchors,
+    keyframe_images,
+    lens_of,
+    pyramid_of,
+)
 from vcl_companion.vision.relative_pose import essential_candidates
 from vcl_companion.vision.schur import eliminated
 
 
 def warm_up() -> None:
-    """Search a relative and an absolute pose in a small scene without noise, and adjust it."""
+    """Search poses in a small scene without noise, adjust it, track a patch."""
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-2.0, 2.0, (40, 2)), rng.uniform(4.0, 8.0, 40)])
     moved = points + np.array([1.0, 0.2, 0.1])
@@ -22,3 +35,53 @@ def warm_up() -> None:
     essential_candidates(ideal_a, ideal_b, 320.0, rng)
     resect(ideal_b, points, 320.0, rng)
     eliminated(np.zeros((1, 6, 3)), np.zeros((1, 3, 3)), np.ones((1, 1), dtype=np.bool_))
+    _track(rng)
+
+
+def _track(rng: np.random.Generator) -> None:
+    """Find the patches of a small image in itself, and refine the pose by them."""
+    camera, still = Camera(96, 96, 80.0, 80.0, 47.5, 47.5), Pose.identity()
+    image = np.asarray(rng.integers(0, 255, (96, 96)), dtype=np.uint8)
+    pixels = rng.uniform(30.0, 60.0, (20, 2))
+    n, ideal = len(pixels), camera.ideal_from_pixels(pixels)
+    flat = np.zeros((n, 2))
+    slopes = np.tile([1 / 80.0, 0.0, 0.0, 1 / 80.0], (n, 1))
+    anchors = Anchors(
+        first=np.arange(n + 1, dtype=np.int64),
+        landmark=np.arange(n, dtype=np.int64),
+        keyframe=np.zeros(n, dtype=np.int64),
+        planes=np.column_stack([ideal, np.ones(n), flat, slopes]),
+        pixels=pixels,
+        points_world=np.column_stack([ideal, np.ones(n)]),
+        own=np.zeros((n, 3)),
+        spread=np.tile([1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6], (n, 1)),
+        texture=np.tile([1e5, 0.0, 1e5], (n, 1)),
+        images=keyframe_images([image], [still]),
+    )
+    lens, frame = lens_of(camera), pyramid_of(image)
+    rules = ChoiceRules(40.0, 4.0, 0.05, 0.5, 0.03, 1.5, 3.5)
+    rows, *_ = choose_anchors(anchors, lens, still, still, np.eye(6), rules, n, 6.0)
+    found = align_patches(anchors, rows, frame, lens, still, np.ones(n), 0, AlignRules())
+    pose = np.ascontiguousarray(still.matrix()[:3])
+    system = (
+        found.ideal,
+        found.slopes,
+        anchors.points_world[rows],
+        anchors.spread[rows],
+        found.noise + found.misplaced + np.array([1.0, 0.0, 1.0]),
+    )
+    pose_kernels.converged(pose, pose, *system, np.zeros((6, 6)), np.ones(1))
+    supported = pose_kernels.supported(pose, pose, *system, 18.4)
+    agrees, _, j_pose, j_point, information = supported
+    pose_kernels.gained(
+        agrees,
+        np.eye(6),
+        j_pose,
+        j_point,
+        information,
+        found.noise,
+        found.misplaced,
+        anchors.own[rows],
+        rows,
+        np.zeros((n, 3, 6)),
+    )

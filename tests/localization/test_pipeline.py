@@ -1,0 +1,106 @@
+"""What a frame's pose rests on: patches where they can be had, features where they are needed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.checks import assert_pose_close, nees
+from tests.daemon import demo
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import exp_so3
+from vcl_companion.localization.intra import (
+    LocalizationOptions,
+    Localized,
+    NotLocalized,
+    Prior,
+    Recognised,
+)
+from vcl_companion.localization.pipeline import PipelineOptions, localize
+from vcl_companion.localization.tracking import TrackingOptions
+from vcl_companion.vision.features import Features, Image
+
+DRONE, FRAME = 2, 4
+OPTIONS = PipelineOptions(demo.FEATURES, LocalizationOptions(), TrackingOptions())
+PAPER, DEFAULT = False, True
+_SIGMA = np.diag(np.repeat([0.1, 0.01], 3) ** 2)
+_OFF = np.array([0.08, -0.08, 0.08, 0.008, -0.008, 0.008])
+
+
+def answered(
+    tracked: bool,
+    prior: Prior | None,
+    image: Image | None = None,
+    recognisable: bool = True,
+) -> Localized | NotLocalized:
+    """A frame of the demo against the map of the drones' first frames."""
+    index, sensor = demo.map_index(1, 2, 3), demo.sensor(DRONE)
+    if not recognisable:
+        blank = np.zeros_like(index.entries.descriptors)
+        index = replace(index, entries=Features(index.entries.pixels, blank))
+    shot = demo.shot(DRONE, FRAME)
+    return localize(
+        shot.image if image is None else image, sensor.camera, sensor.body_from_cam,
+        index, demo.templates(1, 2, 3) if tracked else None, prior,
+        shot.ned_from_body.rotation, OPTIONS,
+    )  # fmt: skip
+
+
+def found(fix: Localized | NotLocalized, by: Recognised) -> Localized:
+    """Near the truth, within what it says of itself."""
+    assert isinstance(fix, Localized), fix.reason
+    assert fix.by == by
+    truth = demo.world_from_body(DRONE, FRAME)
+    assert_pose_close(fix.world_from_body, truth, within_m=0.2, within_rad=0.02)
+    assert nees(truth.local(fix.world_from_body), fix.covariance())[0] < 35.0
+    return fix
+
+
+def prior(moved: Pose | None = None) -> Prior:
+    truth = demo.world_from_body(DRONE, FRAME)
+    return Prior((moved or Pose.identity()) @ truth.retracted(_OFF), _SIGMA)
+
+
+def test_a_predicted_frame_is_tracked_and_no_feature_looked_for() -> None:
+    """Nothing of this map could be recognised by a feature."""
+    found(answered(DEFAULT, prior(), recognisable=False), "patches")
+    assert isinstance(answered(PAPER, prior(), recognisable=False), NotLocalized)
+
+
+def test_without_a_prediction_features_lead_the_patches() -> None:
+    by_features = found(answered(PAPER, None), "features")
+    by_patches = found(answered(DEFAULT, None), "patches")
+    sigmas = [np.sqrt(np.trace(fix.noise_covariance)) for fix in (by_patches, by_features)]
+    assert sigmas[0] < 0.5 * sigmas[1]
+    # Wherever they are led from, patches say the same.
+    predicted = found(answered(DEFAULT, prior()), "patches")
+    assert_pose_close(
+        by_patches.world_from_body, predicted.world_from_body, within_m=0.01, within_rad=1e-3
+    )
+
+
+@pytest.mark.parametrize(
+    "moved",
+    [
+        Pose(np.eye(3), np.array([0.0, 4.0, 0.0])),
+        Pose(exp_so3(np.array([0.0, 0.0, 2.5])), np.zeros(3)),
+    ],
+    ids=["elsewhere", "turned away"],
+)
+def test_a_prediction_that_is_wrong_is_got_over(moved: Pose) -> None:
+    found(answered(DEFAULT, prior(moved)), "patches")
+
+
+def test_the_paper_s_pipeline_finds_features_only() -> None:
+    found(answered(PAPER, prior()), "features")
+
+
+@pytest.mark.parametrize("tracked", [PAPER, DEFAULT])
+def test_a_frame_that_shows_nothing_is_refused_by_what_was_tried_last(tracked: bool) -> None:
+    fog = demo.blank(DRONE)
+    for expected in (None, prior()):
+        refused = answered(tracked, expected, image=fog)
+        assert isinstance(refused, NotLocalized)
+        assert refused == answered(PAPER, None, image=fog)

@@ -1,0 +1,86 @@
+"""From one image to one pose: by patches where that can be had, else by features (IV-D, issue 4).
+
+Two pipelines. The paper's looks for features in every frame and matches them
+against the map. The default follows the map's patches from where the drone is
+expected, and looks for features only when that fails: at the start, when lost,
+when what the patches say is not believed. A pose found by features then leads
+the patches once, so that what is sent is as good as the frame gives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.localization.intra import (
+    LocalizationOptions,
+    Localized,
+    NotLocalized,
+    Prior,
+    localize_intra,
+)
+from vcl_companion.localization.map_index import MapIndex
+from vcl_companion.localization.tracking import TrackingOptions, track
+from vcl_companion.mapping.templates import Templates
+from vcl_companion.vision.features import FeatureOptions, Image, detect
+
+Pipeline = Literal["default", "paper"]
+
+
+@dataclass(frozen=True)
+class PipelineOptions:
+    """What the steps of a frame are tuned by; see each of them."""
+
+    features: FeatureOptions
+    localization: LocalizationOptions
+    tracking: TrackingOptions
+
+
+def localize(
+    image: Image,
+    camera: Camera,
+    body_from_cam: Pose,
+    index: MapIndex,
+    templates: Templates | None,
+    prior: Prior | None,
+    ned_from_body: Array | None,
+    options: PipelineOptions,
+) -> Localized | NotLocalized:
+    """Find the drone's pose in the map; one job for one thread, without a lock.
+
+    Args:
+        image: (H, W) grey.
+        camera: its intrinsics.
+        body_from_cam: its mounting.
+        index: the current map, to be recognised.
+        templates: the same map, to be tracked; None for the paper's pipeline.
+        prior: where the drone is expected, or None.
+        ned_from_body: (3, 3) attitude by the autopilot at that instant, or None.
+        options: of the steps.
+
+    Returns:
+        The pose with its covariance in parts, or why there is none: what the
+        features said, for they were asked last.
+    """
+    if templates is not None and prior is not None:
+        tracked = track(
+            image, camera, body_from_cam, templates, prior, ned_from_body,
+            options.tracking, options.localization,
+        )  # fmt: skip
+        if isinstance(tracked, Localized):
+            return tracked
+    found = localize_intra(
+        detect(image, index.detector, options.features),
+        camera, body_from_cam, index, prior, ned_from_body, options.localization,
+    )  # fmt: skip
+    if templates is None or isinstance(found, NotLocalized):
+        return found
+    closer = track(
+        image, camera, body_from_cam, templates,
+        Prior(found.world_from_body, found.covariance()), ned_from_body,
+        options.tracking, options.localization,
+    )  # fmt: skip
+    return closer if isinstance(closer, Localized) else found

@@ -1,0 +1,310 @@
+"""Where one drone is, by the map's patches near where they are expected (issue 4; IV-D, IV-F)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.localization.coverage import covered_share
+from vcl_companion.localization.intra import (
+    LocalizationOptions,
+    Localized,
+    NotLocalized,
+    Prior,
+    believed,
+)
+from vcl_companion.mapping.templates import Templates
+from vcl_companion.vision.features import Image
+from vcl_companion.vision.information import covariance_of
+from vcl_companion.vision.patches import (
+    Alignment,
+    AlignRules,
+    Anchors,
+    ChoiceRules,
+    Lens,
+    align_patches,
+    choose_anchors,
+    lens_of,
+    pyramid_of,
+)
+from vcl_companion.vision.pose_kernels import CONVERGED, converged, gained, supported
+
+_CHI2_2_99 = 9.21
+_MAX_LEVERAGE = 0.4
+_ROBUST_LOSS = 1.1136
+_SINGULAR = 1e-9
+_MAX_ROUNDS = 3
+_WIDE, _NARROW = np.array([8.0, 3.0, 1.0]), np.array([1.0])
+# Patches warped and begun so near to where they are need no second look.
+_WELL_PREDICTED_PX = 0.5
+
+
+@dataclass(frozen=True)
+class TrackingOptions:
+    """How many patches are tracked, and when the pose is believed.
+
+    Attributes:
+        n_landmarks: patches aligned at full resolution.
+        n_coarse: of these, how many find the way when the prediction is poor.
+        max_radius_px: a prediction less certain than this, 3 sigma, is no prediction.
+        least_score: correlation of an aligned patch, at least.
+        coarse_score: the same at reduced resolution.
+        grey_noise: of an image, grey levels, 1 sigma.
+        misplaced_px: what an alignment is off whatever the view, the same in every frame.
+        misplaced_px_per_deg: per angle between the lines of sight of frame and keyframe.
+        misplaced_px_per_octave: per doubling or halving of the distance.
+        misplaced_by_residual: per sigma that the residual of the grey levels explains.
+    """
+
+    n_landmarks: int = 400
+    n_coarse: int = 120
+    max_radius_px: float = 80.0
+    least_score: float = 0.75
+    coarse_score: float = 0.65
+    grey_noise: float = 4.0
+    misplaced_px: float = 0.04
+    misplaced_px_per_deg: float = 0.009
+    misplaced_px_per_octave: float = 0.03
+    misplaced_by_residual: float = 0.7
+
+    def __post_init__(self) -> None:
+        if not 20 <= self.n_coarse <= self.n_landmarks:
+            raise ValueError(
+                f"n_coarse must lie in 20..n_landmarks, got {self.n_coarse} of {self.n_landmarks}"
+            )
+        for name in ("least_score", "coarse_score"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise ValueError(f"{name} must lie in (0, 1), got {getattr(self, name)}")
+        for name in (
+            "max_radius_px",
+            "grey_noise",
+            "misplaced_px",
+            "misplaced_px_per_deg",
+            "misplaced_px_per_octave",
+            "misplaced_by_residual",
+        ):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
+    def choice(self) -> ChoiceRules:
+        """Return what an alignment is worth."""
+        return ChoiceRules(
+            40.0,
+            self.grey_noise,
+            self.misplaced_px,
+            float(np.rad2deg(self.misplaced_px_per_deg)),
+            self.misplaced_px_per_octave,
+            1.5,
+            3.5,
+        )
+
+
+def track(
+    image: Image,
+    camera: Camera,
+    body_from_cam: Pose,
+    templates: Templates,
+    prior: Prior,
+    ned_from_body: Array | None,
+    options: TrackingOptions,
+    belief: LocalizationOptions,
+) -> Localized | NotLocalized:
+    """Find the drone's pose by the map's patches near where the prediction puts them.
+
+    A poor prediction is first improved at reduced resolution; then the
+    landmarks that fix the pose best are aligned at full resolution.
+
+    Args:
+        image: (H, W) grey.
+        camera: its intrinsics.
+        body_from_cam: its mounting.
+        templates: the current map, prepared.
+        prior: where the drone is expected.
+        ned_from_body: (3, 3) attitude by the autopilot at that instant, or None.
+        options: how it is tracked.
+        belief: when a pose is believed, whatever it rests on.
+
+    Returns:
+        The pose with its covariance in parts, or why there is none.
+    """
+    tracker = _Tracker(image, camera, body_from_cam, templates, options, belief)
+    return tracker.located(prior, ned_from_body)
+
+
+class _Tracker:
+    """One image against one map."""
+
+    def __init__(
+        self,
+        image: Image,
+        camera: Camera,
+        body_from_cam: Pose,
+        templates: Templates,
+        options: TrackingOptions,
+        belief: LocalizationOptions,
+    ) -> None:
+        self._frame = pyramid_of(image)
+        self._camera = camera
+        self._lens: Lens = lens_of(camera)
+        self._mounting = body_from_cam
+        self._templates = templates
+        self._anchors: Anchors = templates.anchors
+        self._options = options
+        self._belief = belief
+
+    def located(self, prior: Prior, ned_from_body: Array | None) -> Localized | NotLocalized:
+        options = self._options
+        pose = prior.world_from_body
+        rows, radii, in_view = self._choose(prior)
+        if len(rows) < self._belief.min_inliers:
+            return NotLocalized(f"{len(rows)} landmarks in view, {self._belief.min_inliers} needed")
+        radius = float(np.quantile(radii, 0.75))
+        if radius > options.max_radius_px:
+            return NotLocalized(f"the prediction is {radius:.0f} px uncertain")
+        if radius > 1.5:
+            coarse = self._coarse(
+                rows[: options.n_coarse], radii[: options.n_coarse], prior, radius
+            )
+            if isinstance(coarse, NotLocalized):
+                return coarse
+            pose = coarse
+        found = self._aligned(rows, pose, np.zeros(len(rows)), 0, options.least_score)
+        refined = self._refined(found, pose, None, _WIDE)
+        if isinstance(refined, NotLocalized):
+            return refined
+        if float(np.median(np.abs(found.pixels - found.predicted))) > _WELL_PREDICTED_PX:
+            found = self._aligned(rows, refined, np.zeros(len(rows)), 0, options.least_score)
+        return self._judged(found, refined, len(rows), in_view, ned_from_body)
+
+    def _choose(self, prior: Prior) -> tuple[NDArray[np.int64], Array, int]:
+        return choose_anchors(
+            self._anchors,
+            self._lens,
+            prior.world_from_body,
+            self._mounting,
+            prior.covariance,
+            self._options.choice(),
+            self._options.n_landmarks,
+            6.0,
+        )
+
+    def _coarse(
+        self, rows: NDArray[np.int64], radii: Array, prior: Prior, radius: float
+    ) -> Pose | NotLocalized:
+        """Improve a prediction at half or quarter resolution."""
+        options = self._options
+        level = 1 if radius <= 8.0 else 2 if radius <= 24.0 else 3
+        level = min(level, len(self._frame.shelves) - 1)
+        pose = prior.world_from_body
+        reach = np.clip(radii, 2.0**level, options.max_radius_px)
+        found = self._aligned(rows, pose, reach, level, options.coarse_score)
+        return self._refined(found, pose, prior, _WIDE)
+
+    def _aligned(
+        self, rows: NDArray[np.int64], pose: Pose, radii: Array, level: int, score: float
+    ) -> Alignment:
+        """Return the patches that were found."""
+        options = self._options
+        found = align_patches(
+            self._anchors,
+            rows,
+            self._frame,
+            self._lens,
+            (pose @ self._mounting).inverse(),
+            radii,
+            level,
+            AlignRules(
+                least_score=score,
+                misplaced_px=options.misplaced_px,
+                misplaced_px_per_rad=float(np.rad2deg(options.misplaced_px_per_deg)),
+                misplaced_px_per_octave=options.misplaced_px_per_octave,
+                misplaced_by_residual=options.misplaced_by_residual,
+            ),
+        )
+        return found.of(found.found)
+
+    def _refined(
+        self, found: Alignment, pose: Pose, prior: Prior | None, scales: Array
+    ) -> Pose | NotLocalized:
+        n = len(found.anchors)
+        if n < self._belief.min_inliers:
+            return NotLocalized(f"{n} patches found, {self._belief.min_inliers} needed", n)
+        known = np.zeros((6, 6))
+        if prior is not None:
+            known = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
+        matrix, outcome = converged(*self._system(pose, found), known, scales)
+        if outcome != CONVERGED:
+            return NotLocalized("the patches found do not fix a pose", n)
+        return Pose(matrix[:, :3], matrix[:, 3])
+
+    def _system(
+        self, pose: Pose, found: Alignment
+    ) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
+        return (
+            np.ascontiguousarray(pose.matrix()[:3]),
+            np.ascontiguousarray(self._mounting.matrix()[:3]),
+            found.ideal,
+            found.slopes,
+            self._anchors.points_world[found.anchors],
+            self._anchors.spread[found.anchors],
+            found.noise + found.misplaced,
+        )
+
+    def _judged(
+        self,
+        found: Alignment,
+        pose: Pose,
+        n_tried: int,
+        in_view: int,
+        ned_from_body: Array | None,
+    ) -> Localized | NotLocalized:
+        """Refine a last time, and say how certain the pose is."""
+        uncertainty = self._templates.uncertainty
+        for _ in range(_MAX_ROUNDS):
+            refined = self._refined(found, pose, None, _NARROW)
+            if isinstance(refined, NotLocalized):
+                return refined
+            pose = refined
+            agrees, normal, j_pose, j_point, information = supported(
+                *self._system(pose, found), 2.0 * _CHI2_2_99
+            )
+            n = int(agrees.sum())
+            if n < self._belief.min_inliers:
+                least = self._belief.min_inliers
+                return NotLocalized(f"{n} landmarks agree on a pose, {least} needed", n_tried, n)
+            inverse = covariance_of(normal, _SINGULAR)
+            if inverse is None:
+                return NotLocalized("the patches found do not fix a pose", n_tried, n)
+            leverage, covariances, lever = gained(
+                agrees, inverse, j_pose, j_point, information, found.noise, found.misplaced,
+                self._anchors.own[found.anchors], self._anchors.landmark[found.anchors],
+                uncertainty.landmark_lever,
+            )  # fmt: skip
+            decisive = leverage > _MAX_LEVERAGE
+            if not decisive.any():
+                break
+            found = found.of(~decisive)
+        else:
+            return NotLocalized("single landmarks decide the pose: the others do not fix it")
+        by_noise, by_misplacement, by_landmarks = covariances
+        fix = Localized(
+            pose,
+            _ROBUST_LOSS * by_noise,
+            _ROBUST_LOSS * by_misplacement + by_landmarks,
+            lever,
+            uncertainty.keyframe_covariance,
+            n_tried,
+            n,
+            True,
+            float(np.sqrt(information[-1, 0] / n)),
+            # Those that were not tried would fare like those that were.
+            round(in_view * n / n_tried),
+            covered_share(found.pixels[agrees > 0], self._camera),
+            "patches",
+        )
+        return believed(fix, ned_from_body, self._belief)
