@@ -22,6 +22,7 @@ class MapOptions:
         distance_sigma_m: how well the known distances are known, 1 sigma.
         max_depth_error: relative depth error, 1 sigma, median over the landmarks,
             above which the map is refused; twice that and a landmark is left out.
+        patches: observations are measured again by patches; without, as the detectors say.
         max_keyframes: an extended map keeps at most this many.
         max_landmarks: and at most this many landmarks.
         member_wait_s: how long a first map waits for members that are not there yet.
@@ -37,6 +38,7 @@ class MapOptions:
     attitude_sigma_deg: float = 4.0
     distance_sigma_m: float = 0.01
     max_depth_error: float = 0.1
+    patches: bool = True
     max_keyframes: int = 24
     max_landmarks: int = 12_000
     member_wait_s: float = 10.0

@@ -43,7 +43,7 @@ _MAX_REPROJECTION_PX = 2.0
 _CHI2_1_99 = 6.63
 # Keyframe poses of maps against truth had 2.7 to 4.5 times the variance that independent
 # pixel noise explains: what a detector misplaces is alike in neighbouring landmarks.
-_KEYFRAME_OPTIMISM = 4.0
+_KEYFRAME_OPTIMISM = 1.0
 _RULES = AlignRules(max_iterations=12, least_score=0.8, max_moved_px=3.0)
 
 
