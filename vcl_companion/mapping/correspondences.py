@@ -69,7 +69,7 @@ class Correspondences:
             cam = one.world_from_body @ self._views[i].body_from_cam
             visible = self._visible(known, i, cam)
             overlap = [
-                _overlap(known.points_world[visible & known.seen[:, k]], cam, origin)
+                overlap(known.points_world[visible & known.seen[:, k]], cam, origin)
                 for k, origin in enumerate(origins)
             ]
             for k in np.argsort(overlap)[::-1][:_PARTNERS]:
@@ -101,7 +101,7 @@ class Correspondences:
         visible = {i: self._visible(known, i, cam) for i, cam in cams.items()}
         for i in cams:
             overlap = {
-                k: _overlap(known.points_world[visible[i] & visible[k]], cams[i], cams[k])
+                k: overlap(known.points_world[visible[i] & visible[k]], cams[i], cams[k])
                 for k in cams
                 if k != i
             }
@@ -155,7 +155,7 @@ def unique(links: PairMatches) -> PairMatches:
     return PairMatches(pairs[:, 0], pairs[:, 1])
 
 
-def _overlap(points: Array, one: Pose, other: Pose) -> float:
+def overlap(points: Array, one: Pose, other: Pose) -> float:
     """Return how many points two cameras share, counted by the angle they are seen under."""
     a, b = points - one.translation, points - other.translation
     lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)

@@ -89,6 +89,11 @@ class PatchTable:
             [p.shelves[:n_levels] + np.array([s, 0, 0]) for p, s in zip(shown, starts, strict=True)]
         ).astype(np.int64)
 
+    @property
+    def n_views(self) -> int:
+        """How many views there are."""
+        return len(self._cameras)
+
     def found(
         self,
         reference: Reference,

@@ -6,13 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.culling import depth_errors, fitting
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.patch_table import PatchTable, PyramidOf, Reference, decoded_pyramid
 from vcl_companion.mapping.uncertainty import views_of
-from vcl_companion.vision.bundle import BundleOptions, adjust, reprojection_residuals
+from vcl_companion.vision.bundle import BundleOptions, adjust
 from vcl_companion.vision.patches import AlignRules, Pyramid
 
 # A first alignment starts from poses that are some pixels off, the next ones do not.
