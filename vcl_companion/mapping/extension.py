@@ -22,10 +22,11 @@ from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.growth import Growth, keyframe_of
 from vcl_companion.mapping.known_features import Index
 from vcl_companion.mapping.landmark_map import LandmarkMap
-from vcl_companion.mapping.new_landmarks import Shown, free_of, new_landmarks, shown
+from vcl_companion.mapping.new_landmarks import Shown, free_of, new_landmarks, shown, with_room
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.patch_table import PatchTable, PyramidOf, Reference
 from vcl_companion.mapping.placing import Placed, place, references
+from vcl_companion.mapping.thinning import spread
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.mapping.uncertainty import MapUncertainty, views_of
 from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust
@@ -145,7 +146,7 @@ class Extension:
         columns = [self._n_keys + i for i in joined]
         partners = {c: self._partners(table, c, cams) for c in columns}
         used = sorted({*columns, *(k for some in partners.values() for k in some)})
-        detector = self._options.detectors[0]
+        detector, per_cell = self._options.detectors[0], self._options.landmarks_per_cell
         views: dict[int, Shown] = {}
         for c in used:
             try:
@@ -158,11 +159,16 @@ class Extension:
             others = [t for t in [*columns, *partners[c]] if t != c and t in views]
             if c not in views or not others:
                 continue
+            shown_by = dict(views)
+            taken_px = _seen_px(table.observed, c)
+            shown_by[c] = with_room(views[c], taken_px, self._cameras[c], per_cell)
             known = table.points[np.isfinite(table.observed[:, c, 0])]
             known = known[np.isfinite(known[:, 0])]
             observed, points = new_landmarks(
-                c, others, views, self._cameras, cams, known, self._table
+                c, others, shown_by, self._cameras, cams, known, self._table
             )
+            kept = spread(observed[:, [c]], [self._cameras[c]], per_cell)
+            observed, points = observed[kept], points[kept]
             table = replace(
                 table,
                 observed=np.concatenate([table.observed, observed]),

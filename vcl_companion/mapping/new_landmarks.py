@@ -12,6 +12,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.known_features import Index
 from vcl_companion.mapping.patch_table import PatchTable, Reference
+from vcl_companion.mapping.thinning import N_CELLS, cells_of
 from vcl_companion.vision.features import Features
 from vcl_companion.vision.guided_pairs import match_epipolar
 from vcl_companion.vision.patches import AlignRules
@@ -53,6 +54,13 @@ def free_of(view: Shown, taken_px: Array) -> Shown:
         return view
     distance, _ = cKDTree(taken_px).query(view.features.pixels)
     free = np.flatnonzero(np.asarray(distance) > _SAME_PX)
+    return Shown(view.features.subset(free), view.ideal[free])
+
+
+def with_room(view: Shown, taken_px: Array, camera: Camera, per_cell: int) -> Shown:
+    """Return those features in whose cells fewer than so many of (K, 2) pixels lie."""
+    taken = np.bincount(cells_of(taken_px, camera), minlength=N_CELLS)
+    free = np.flatnonzero(taken[cells_of(view.features.pixels, camera)] < per_cell)
     return Shown(view.features.subset(free), view.ideal[free])
 
 

@@ -15,6 +15,7 @@ from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.scale import metric
 from vcl_companion.mapping.scene import grown_from
 from vcl_companion.mapping.sharpening import sharpened
+from vcl_companion.mapping.thinning import thinned
 from vcl_companion.mapping.tracks import pixels_of_tracks
 from vcl_companion.mapping.uncertainty import map_uncertainty
 from vcl_companion.mapping.visibility import Edge, visibility_graph
@@ -81,8 +82,12 @@ def _build(
     if isinstance(made, NoMap):
         return made
     # Patches from far apart may not resemble each other enough: then the features have to do.
-    better = accepted(sharpened(made, options), options) if options.patches else NoMap("")
-    return accepted(made, options) if isinstance(better, NoMap) else better
+    if options.patches:
+        sharp = thinned(sharpened(made, options), options.landmarks_per_cell)
+        better = accepted(sharp, options)
+        if isinstance(better, LandmarkMap):
+            return better
+    return accepted(made, options)
 
 
 def accepted(landmark_map: LandmarkMap, options: MapOptions) -> LandmarkMap | NoMap:
