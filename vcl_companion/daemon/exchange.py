@@ -47,7 +47,7 @@ from vcl_companion.swarm.transfer import (
     TransferFailed,
     Transfers,
 )
-from vcl_companion.swarm.updates import OwnVote, UpdateOptions
+from vcl_companion.swarm.updates import OwnVote, Sight, UpdateOptions
 from vcl_companion.vision.features import Detector, FeatureOptions
 from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.frame_codec import decode_frame
@@ -332,7 +332,7 @@ class Exchange:
         stored = self._maps.current
         before = self._wants_update
         self._wants_update = self._vote.look(
-            stored.revision if stored else b"", self._estimator.tracked, now_s
+            stored.revision if stored else b"", Sight(self._estimator.tracked), now_s
         )
         return self._wants_update != before
 

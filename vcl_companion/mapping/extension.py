@@ -17,7 +17,7 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.correspondences import overlap
-from vcl_companion.mapping.culling import Mask, decisive, depth_errors, fitting, placed
+from vcl_companion.mapping.culling import Mask, depth_errors, fitting, placed
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.growth import Growth, keyframe_of
 from vcl_companion.mapping.known_features import Index
@@ -213,8 +213,6 @@ class Extension:
         limit_px = max(_LIMIT_PX[turn], _MAX_SIGMAS * self._old.pixel_noise_px)
         fits, good = fitting(views, 2.0 * limit_px, self._options)
         views = replace(views, ideal=np.where(fits[..., None], ideal, np.nan))
-        if turn == 1:
-            good[np.flatnonzero(good)[decisive(_of(views, good))]] = False
         adjusted, noise_px = adjust(
             _of(views, good), BundleOptions(_STEPS[turn], _CAUCHY_PX, least_gain=1e-5)
         )

@@ -21,8 +21,8 @@ from vcl_companion.vision.patches import AlignRules
 from vcl_companion.vision.resection import NotFound, ResectionOptions, Sightings, refine
 
 _MIN_INLIERS = 20
-# So many landmarks fix a pose; more cost time.
-_WANTED = 1500
+# So many landmarks fix a pose; all of them are looked for once that is known.
+_WANTED = 500
 _NOISE_PX = 0.15
 _WIDE = AlignRules(max_iterations=15, least_score=0.75, max_moved_px=3.0)
 _CLOSE = AlignRules(max_iterations=15, least_score=0.8, max_moved_px=1.5, settled_px=0.02)

@@ -28,7 +28,7 @@ _SINGULAR = 1e-11
 # little of it: it acts on keyframes like so much more independent noise. NEES of keyframes by
 # it, 6 degrees of freedom, first maps of rendered flights and photographs made of patches:
 # 0.7 to 12, median 3.
-SHARED_NOISE_PX = 0.3
+SHARED_NOISE_PX = 0.4
 # No distance between drones is known better; much smaller sigmas overflow.
 _FINEST_M = 1e-6
 

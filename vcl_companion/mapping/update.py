@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.pose import Pose
 from vcl_companion.mapping.continuity import broken_continuity, pruned
 from vcl_companion.mapping.correspondences import Correspondences, unique
 from vcl_companion.mapping.drone_view import DroneView, decode_image
@@ -90,6 +91,7 @@ def extended(
         return NoMap(str(error))
     growth: Growth | None = None
     if options.patches:
+        views = _guessed(old, sure, views, features_of, options, seed)
         extension = Extension(old, sure, views, features_of, pyramid_of, options)
         growth = extension.run()
     if growth is None or len(growth.views) < len(views):
@@ -103,6 +105,30 @@ def extended(
         return NoMap(reason)
     made = pruned(replace(growth.landmark_map, parent=parent), len(old.keyframes), options)
     return accepted(made, options)
+
+
+def _guessed(
+    old: LandmarkMap,
+    sure: MapUncertainty,
+    views: list[DroneView],
+    features_of: ImageFeatures,
+    options: MapOptions,
+    seed: int,
+) -> list[DroneView]:
+    """Return the views, with poses by features for those that do not say where they are."""
+    lost = [i for i, v in enumerate(views) if v.world_from_body is None]
+    first = options.detectors[:1]
+    library = KeyframeLibrary(old, of_keyframes(features_of, first))
+    out = list(views)
+    for i in lost:
+        try:
+            found = features_of(views[i].image_bytes, views[i].camera, first[0])
+        except ValueError:
+            continue
+        view = replace(views[i], features=(found,))
+        pose = _Update(old, sure, [view], library, options, seed).pose_on_old()
+        out[i] = replace(views[i], world_from_body=pose)
+    return out
 
 
 def _by_features(
@@ -193,6 +219,11 @@ class _Update:
         if growth is None:
             return NoMap("no new view fits the map: " + "; ".join(self._told()))
         return growth
+
+    def pose_on_old(self) -> Pose | None:
+        """Return where the only view is by landmarks of the old map; None where these do not say."""
+        self._join_old(0)
+        return self._joined[0].world_from_body if self._joined else None
 
     def _told(self) -> list[str]:
         return [f"drone {self._views[i].drone_id}: {r}" for i, r in sorted(self._reasons.items())]

@@ -63,7 +63,7 @@ class UpdateOptions:
     # Beside its own keyframe a map is seen half as well again as from anywhere else, so half
     # of the most is two thirds of what is usual: it has to be early, for the same reason.
     share: float = 0.5
-    covered: float = 0.45
+    covered: float = 0.6
     sigma_m: float = 0.01
     sigma_growth: float = 2.0
     hold_s: float = 0.5
