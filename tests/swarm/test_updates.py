@@ -320,3 +320,36 @@ def test_rounds_that_do_not_help_become_rare_until_one_helps() -> None:
     sky.run(16.0)
     pauses = np.diff([at_s for at_s, _ in sky.begun[n_before:]]) - sky.round_s
     assert pauses[0] == pytest.approx(interval_s, abs=4 * STEP_S)
+
+
+def judged(sights: list[Sight]) -> bool:
+    """The vote after so many tenths of a second of what is seen."""
+    vote = OwnVote(OPTIONS)
+    return [vote.look(FIRST, sight, k * STEP_S) for k, sight in enumerate(sights)][-1]
+
+
+def test_who_sees_the_map_in_a_corner_of_the_image_only_votes() -> None:
+    wide, narrow = (Sight(PLENTY, OPTIONS.covered + d) for d in (0.2, -0.05))
+    assert judged([wide] * 20 + [narrow] * 20)
+    assert not judged([wide] * 40)
+    assert not judged([narrow] * 40)  # the sky never covers more
+
+
+def test_who_knows_its_place_twice_worse_than_at_best_votes() -> None:
+    sure = Sight(PLENTY, None, 3.0 * OPTIONS.sigma_m)
+    worse = Sight(PLENTY, None, 1.01 * OPTIONS.sigma_growth * 3.0 * OPTIONS.sigma_m)
+    assert judged([sure] * 20 + [worse] * 20)
+    assert not judged([sure] * 40)
+    assert not judged([worse] * 40)
+    best = Sight(PLENTY, None, 0.1 * OPTIONS.sigma_m)
+    good = Sight(PLENTY, None, 0.99 * OPTIONS.sigma_m)
+    assert not judged([best] * 20 + [good] * 20)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("covered", -0.1), ("covered", 1.0), ("sigma_m", 0.0), ("sigma_growth", 1.0)],
+)
+def test_the_reasons_for_a_vote_are_bounded(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name):
+        UpdateOptions(**{name: value})

@@ -21,7 +21,7 @@ from vcl_companion.mapping.culling import Mask, depth_errors, fitting, placed
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.growth import Growth, keyframe_of
 from vcl_companion.mapping.known_features import Index
-from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.new_landmarks import Shown, free_of, new_landmarks, shown, with_room
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.patch_table import PatchTable, PyramidOf, Reference
@@ -88,7 +88,7 @@ class Extension:
         self._old, self._sure, self._views, self._options = old, sure, views, options
         self._features_of = features_of
         self._n_keys = len(old.keyframes)
-        shown_by = [*old.keyframes, *views]
+        shown_by: list[Keyframe | DroneView] = [*old.keyframes, *views]
         self._cameras = [v.camera for v in shown_by]
         self._images = [(v.image_bytes, v.camera) for v in shown_by]
         self._mountings = tuple(v.body_from_cam for v in shown_by)
@@ -228,7 +228,7 @@ class Extension:
         )
 
     def _measured_again(self, table: Table, good: Mask, joined: list[int]) -> Table:
-        """Look for all patches again from adjusted poses: old ones in new views, new ones in all."""
+        """Look for patches again from adjusted poses: old ones in new views, new ones in all."""
         cams = self._cams(table)
         observed = table.observed.copy()
         old = np.flatnonzero(good & (table.source < 0))

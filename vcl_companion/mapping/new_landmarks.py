@@ -42,7 +42,7 @@ class Shown:
 
 
 def shown(features: Features, camera: Camera) -> Shown:
-    """Return features with their ideal image coordinates; what the lens cannot produce is left out."""
+    """Return features with their ideal coordinates, without what the lens cannot produce."""
     ideal = camera.ideal_from_pixels(features.pixels)
     usable = np.flatnonzero(np.isfinite(ideal).all(axis=1))
     return Shown(features.subset(usable), ideal[usable])

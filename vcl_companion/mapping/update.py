@@ -116,18 +116,20 @@ def _guessed(
     seed: int,
 ) -> list[DroneView]:
     """Return the views, with poses by features for those that do not say where they are."""
-    lost = [i for i, v in enumerate(views) if v.world_from_body is None]
-    first = options.detectors[:1]
-    library = KeyframeLibrary(old, of_keyframes(features_of, first))
     out = list(views)
-    for i in lost:
-        try:
-            found = features_of(views[i].image_bytes, views[i].camera, first[0])
-        except ValueError:
-            continue
-        view = replace(views[i], features=(found,))
-        pose = _Update(old, sure, [view], library, options, seed).pose_on_old()
-        out[i] = replace(views[i], world_from_body=pose)
+    # The second detector costs as much again, and sees from farther apart.
+    for detectors in dict.fromkeys((options.detectors[:1], options.detectors)):
+        library = KeyframeLibrary(old, of_keyframes(features_of, detectors))
+        for i, view in enumerate(out):
+            if view.world_from_body is not None:
+                continue
+            try:
+                found = tuple(features_of(view.image_bytes, view.camera, d) for d in detectors)
+            except ValueError:
+                continue
+            shown = replace(view, features=found)
+            pose = _Update(old, sure, [shown], library, options, seed).pose_on_old()
+            out[i] = replace(view, world_from_body=pose)
     return out
 
 
@@ -145,9 +147,7 @@ def _by_features(
     usable = []
     for view in waiting:
         try:
-            found = tuple(
-                features_of(view.image_bytes, view.camera, d) for d in options.detectors
-            )
+            found = tuple(features_of(view.image_bytes, view.camera, d) for d in options.detectors)
         except ValueError:
             continue
         usable.append(replace(view, features=found))
@@ -221,7 +221,7 @@ class _Update:
         return growth
 
     def pose_on_old(self) -> Pose | None:
-        """Return where the only view is by landmarks of the old map; None where these do not say."""
+        """Return where the only view is by old landmarks; None where these do not say."""
         self._join_old(0)
         return self._joined[0].world_from_body if self._joined else None
 

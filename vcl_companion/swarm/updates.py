@@ -148,7 +148,7 @@ class OwnVote:
         self._seen.append((now_s, sight))
         while self._seen[0][0] < now_s - _WINDOW_S:
             self._seen.popleft()
-        if not revision:
+        if not revision or not (self._options.tracked or self._options.share):
             self._wants = False
         elif now_s - self._since_s >= _JUDGED_SHARE * _WINDOW_S:
             self._wants = self._is_little() or self._is_narrow() or self._is_vague()

@@ -111,7 +111,8 @@ def reduced(
 
     Args:
         points: (N, 3).
-        bodies, mountings: (V, 3, 4).
+        bodies: (V, 3, 4) world_from_body.
+        mountings: (V, 3, 4) body_from_cam.
         first: (N + 1,) where each landmark's observations begin.
         view: (M,) of each observation.
         slopes: (M, 2, 2) d(pixel) / d(ideal).

@@ -17,6 +17,8 @@ _RATIO = 0.9
 # Two features so close together are the same corner: neither makes the other ambiguous.
 _SAME_PX = 5.0
 _MIN_DEPTH = 0.02
+# Unrelated descriptors differ in half of their bits, or by a squared distance of one.
+_MAX_BITS_DIFFERENT, _MAX_SQUARED = 0.28, 0.6
 
 
 def match_epipolar(
@@ -57,6 +59,7 @@ def match_epipolar(
     distance = _distances(a, b, owner, other)
     chosen = _clear(first, other, distance, b.pixels, _RATIO, _SAME_PX)
     chosen = chosen[chosen >= 0]
+    chosen = chosen[distance[chosen] < _unrelated(a)]
     # Of several that chose the same one the closest stays.
     order = chosen[np.argsort(distance[chosen], kind="stable")]
     _, where = np.unique(other[order], return_index=True)
@@ -71,6 +74,13 @@ def _distances(a: Features, b: Features, i: Index, k: NDArray[np.int64]) -> Arra
         return np.asarray(np.bitwise_count(different).sum(axis=1, dtype=np.int64), dtype=np.float64)
     products = np.einsum("pd,pd->p", a.descriptors[i], b.descriptors[k])
     return np.asarray(2.0 - 2.0 * products, dtype=np.float64)
+
+
+def _unrelated(features: Features) -> float:
+    """Return the distance from which on two descriptors have nothing to do with each other."""
+    if features.descriptors.dtype == np.uint8:
+        return _MAX_BITS_DIFFERENT * 8.0 * features.descriptors.shape[1]
+    return _MAX_SQUARED
 
 
 @compiled
@@ -152,7 +162,7 @@ def _clear(
         for p in range(first[i], first[i + 1]):
             dx = pixels[other[p], 0] - pixels[other[best], 0]
             dy = pixels[other[p], 1] - pixels[other[best], 1]
-            if dx * dx + dy * dy > same_px * same_px and distance[best] > ratio * distance[p]:
+            if dx * dx + dy * dy > same_px * same_px and distance[best] >= ratio * distance[p]:
                 clear = False
                 break
         if clear:
