@@ -61,7 +61,8 @@ def test_what_looks_alike_along_the_line_is_left_out_and_elsewhere_does_not_matt
     twin = B_FROM_A.apply(ray / (0.4 * inverse[0] + 0.6 * DEPTHS[1]))
     for place, matched in ((twin[:2] / twin[2], False), (ideal_b[0] + [0.0, 0.2], True)):
         more = Features(
-            np.vstack([b.pixels, place * FOCAL_PX]), np.vstack([b.descriptors, b.descriptors[:1]])
+            np.vstack([b.pixels, place * FOCAL_PX]),
+            np.asarray(np.vstack([b.descriptors, b.descriptors[:1]]), dtype=np.uint8),
         )
         i, _, _ = match_epipolar(
             a, more, ideal_a, np.vstack([ideal_b, place]), B_FROM_A, DEPTHS, FOCAL_PX

@@ -33,8 +33,10 @@ def match_epipolar(
     """Match features along epipolar lines: each other's best, clearly better than the next.
 
     Args:
-        a, b: features of two images.
-        ideal_a, ideal_b: (N, 2) and (K, 2) where they are, x/z, y/z.
+        a: features of one image.
+        b: of another.
+        ideal_a: (N, 2) where they are, x/z, y/z.
+        ideal_b: (K, 2) likewise.
         b_from_a: relative pose of the cameras, metric.
         inverse_depths: least and largest that points have in camera a, 1/m.
         focal_px: of camera b.
@@ -79,7 +81,7 @@ def _distances(a: Features, b: Features, i: Index, k: NDArray[np.int64]) -> Arra
 def _unrelated(features: Features) -> float:
     """Return the distance from which on two descriptors have nothing to do with each other."""
     if features.descriptors.dtype == np.uint8:
-        return _MAX_BITS_DIFFERENT * 8.0 * features.descriptors.shape[1]
+        return float(_MAX_BITS_DIFFERENT * 8 * features.descriptors.shape[1])
     return _MAX_SQUARED
 
 
