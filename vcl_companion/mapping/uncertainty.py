@@ -25,9 +25,9 @@ from vcl_companion.vision.schur import eliminated
 # landmarks of little parallax leaves 1e-12 by rounding.
 _SINGULAR = 1e-11
 # What displaces a feature or a patch is alike in neighbouring ones, so that residuals tell too
-# little of it: it acts on keyframes like so much more independent noise. NEES of keyframes by
-# it, 6 degrees of freedom: 0.5 to 10 on rendered flights after several extensions (median 3),
-# up to 20 on photographs; of poses tracked on these maps the median is 3 to 10.
+# little of it: it acts on keyframes like so much more independent noise. NEES of keyframes
+# after several extensions, 6 degrees of freedom, measured with 0.4 and scaled to this: 0.4 to
+# 10 on rendered flights (median 3), up to 40 on photographs: still too sure there.
 SHARED_NOISE_PX = 0.5
 # No distance between drones is known better; much smaller sigmas overflow.
 _FINEST_M = 1e-6
