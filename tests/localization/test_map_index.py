@@ -97,21 +97,21 @@ def test_landmarks_of_another_detector_serve_the_geometry_only() -> None:
     landmark_map = photographed()
     n = len(landmark_map.points_world) // 2
     observed = landmark_map.observed_px.copy()
-    observed[:n] += 0.4  # nobody finds a feature exactly there
+    observed[:n] += 2.4  # nobody finds these features there
     index = index_map(replace(landmark_map, observed_px=observed), "akaze", FEATURES)
     # But for the odd one that another feature happens to be near.
-    assert (index.owner < n).sum() < 0.02 * n
+    assert (index.owner < n).sum() < 0.1 * n
     assert len(np.unique(index.owner[index.owner >= n])) == len(landmark_map.points_world) - n
     assert len(index.landmark_covariances) == len(landmark_map.points_world)
 
 
 def test_a_map_without_a_landmark_to_recognise_is_refused() -> None:
     landmark_map = photographed()
-    quarter = np.linspace(0.25, 0.45, 10)[:, None, None]
+    aside = np.linspace(2.25, 2.45, 10)[:, None, None]
     few = replace(
         landmark_map,
         points_world=landmark_map.points_world[:10],
-        observed_px=landmark_map.observed_px[:10] + quarter,
+        observed_px=landmark_map.observed_px[:10] + aside,
     )
     with pytest.raises(ValueError, match="no landmark that akaze finds again"):
         index_map(few, "akaze", FEATURES)

@@ -12,11 +12,12 @@ from tests.checks import assert_pose_close
 from tests.mapping.rendered import panels, rendered_view
 from tests.mapping.views import descriptors_of, drone_views, world_from_scene
 from tests.scenes import PINHOLE, Scene, observe
+from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, matrix_from_euler
 from vcl_companion.mapping.continuity import MAX_IMAGE_BYTES
 from vcl_companion.mapping.drone_view import DroneView
-from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
+from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.reconstruction import reconstruct
 from vcl_companion.mapping.uncertainty import map_uncertainty
@@ -57,7 +58,9 @@ def flight(
 ) -> tuple[Scene, list[DroneView]]:
     """Return what drones see of a street, one view for each pose; the first three make the map."""
     scene = observe(rng, street(rng), bodies, (MOUNTING,) * len(bodies), PINHOLE, noise_px=noise_px)
-    return scene, drone_views(rng, scene, ids, attitude_sigma_rad=0.02)
+    views = drone_views(rng, scene, ids, attitude_sigma_rad=0.02)
+    # No images: what is tested here is registration by features. Bytes tell the views apart.
+    return scene, [replace(v, image_bytes=b"view %d" % k) for k, v in enumerate(views)]
 
 
 def first_map(scene: Scene, views: list[DroneView]) -> LandmarkMap:
@@ -75,9 +78,9 @@ def extension(
 ) -> LandmarkMap | NoMap:
     """Extend a map whose keyframes' features are those of the views they were."""
 
-    def features_of(keyframe: Keyframe) -> tuple[Features, ...]:
-        same = (keyframe.drone_id, keyframe.captured_at_ns)
-        return next(v.features for v in views if (v.drone_id, v.captured_at_ns) == same)
+    def features_of(image_bytes: bytes, camera: Camera, detector: Detector) -> Features:
+        view = next(v for v in [*views, *new] if v.image_bytes == image_bytes)
+        return view.features[options.detectors.index(detector)]
 
     return extended(old, PARENT, new, features_of, options)
 

@@ -11,7 +11,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from vcl_companion.swarm.group import Group, SwarmOptions
-from vcl_companion.swarm.updates import OwnVote, UpdateOptions, UpdateTrigger
+from vcl_companion.swarm.updates import OwnVote, Sight, UpdateOptions, UpdateTrigger
 from vcl_companion.wire.messages import MapState
 from vcl_companion.wire.tunnel import decode_payload, encode_payload
 
@@ -24,7 +24,7 @@ PLENTY, FEW = 400, 20
 def voted(seen: list[int], revision: bytes = FIRST, options: UpdateOptions = OPTIONS) -> bool:
     """The vote after so many tenths of a second of what is seen."""
     vote = OwnVote(options)
-    return [vote.look(revision, n, k * STEP_S) for k, n in enumerate(seen)][-1]
+    return [vote.look(revision, Sight(n), k * STEP_S) for k, n in enumerate(seen)][-1]
 
 
 def test_who_sees_few_landmarks_votes_and_who_sees_many_does_not() -> None:
@@ -50,11 +50,11 @@ def test_one_bad_frame_changes_nothing() -> None:
 def test_a_vote_stands_until_the_new_map_has_been_seen_for_a_while() -> None:
     vote = OwnVote(OPTIONS)
     for k in range(20):
-        vote.look(FIRST, PLENTY, k * STEP_S)
-    assert vote.look(FIRST, FEW, 2.0) is False
-    assert [vote.look(FIRST, FEW, 2.1 + k * STEP_S) for k in range(10)][-1]
-    assert vote.look(SECOND, PLENTY, 3.2)
-    assert not [vote.look(SECOND, PLENTY, 3.3 + k * STEP_S) for k in range(6)][-1]
+        vote.look(FIRST, Sight(PLENTY), k * STEP_S)
+    assert vote.look(FIRST, Sight(FEW), 2.0) is False
+    assert [vote.look(FIRST, Sight(FEW), 2.1 + k * STEP_S) for k in range(10)][-1]
+    assert vote.look(SECOND, Sight(PLENTY), 3.2)
+    assert not [vote.look(SECOND, Sight(PLENTY), 3.3 + k * STEP_S) for k in range(6)][-1]
 
 
 def test_without_a_map_or_with_updates_turned_off_nobody_votes() -> None:
@@ -141,7 +141,7 @@ class Sky:
 
     def _step(self, own_id: int, member: Member) -> None:
         member.group.poll(self.now_s)
-        wants = member.vote.look(member.revision, member.tracked, self.now_s)
+        wants = member.vote.look(member.revision, Sight(member.tracked), self.now_s)
         before = member.group.state_of(own_id)
         state = MapState(member.revision, 0, member.tracked > 0, member.tracked, wants)
         member.group.set_own_state(state)
@@ -324,3 +324,37 @@ def test_rounds_that_do_not_help_become_rare_until_one_helps() -> None:
     sky.run(16.0)
     pauses = np.diff([at_s for at_s, _ in sky.begun[n_before:]]) - sky.round_s
     assert pauses[0] == pytest.approx(interval_s, abs=4 * STEP_S)
+
+
+def judged(sights: list[Sight]) -> bool:
+    """The vote after so many tenths of a second of what is seen."""
+    vote = OwnVote(OPTIONS)
+    return [vote.look(FIRST, sight, k * STEP_S) for k, sight in enumerate(sights)][-1]
+
+
+def test_who_sees_the_map_in_a_corner_of_the_image_only_votes() -> None:
+    wide, narrow = (Sight(PLENTY, OPTIONS.covered + d) for d in (0.2, -0.05))
+    assert judged([wide] * 20 + [narrow] * 20)
+    assert not judged([wide] * 40)
+    assert not judged([narrow] * 40)  # the sky never covers more
+
+
+def test_who_knows_its_place_twice_worse_than_at_best_votes() -> None:
+    sure = Sight(PLENTY, None, 3.0 * OPTIONS.sigma_m)
+    worse = Sight(PLENTY, None, 1.01 * OPTIONS.sigma_growth * 3.0 * OPTIONS.sigma_m)
+    assert judged([sure] * 20 + [worse] * 20)
+    assert not judged([sure] * 40)
+    assert not judged([worse] * 40)
+    best = Sight(PLENTY, None, 0.1 * OPTIONS.sigma_m)
+    good = Sight(PLENTY, None, 0.99 * OPTIONS.sigma_m)
+    assert not judged([best] * 20 + [good] * 20)
+
+
+def test_the_reasons_for_a_vote_are_bounded() -> None:
+    for covered in (-0.1, 1.0):
+        with pytest.raises(ValueError, match="covered"):
+            UpdateOptions(covered=covered)
+    with pytest.raises(ValueError, match="sigma_m"):
+        UpdateOptions(sigma_m=0.0)
+    with pytest.raises(ValueError, match="sigma_growth"):
+        UpdateOptions(sigma_growth=1.0)

@@ -28,6 +28,7 @@ def _frames(draw: st.DrawFn) -> FrameAnswer:
         body_from_cam=random_pose(rng, 0.5),
         camera=draw(st.sampled_from(CAMERAS)),
         image_bytes=draw(st.binary(min_size=1, max_size=400)),
+        world_from_body=random_pose(rng, 30.0) if draw(st.booleans()) else None,
     )
 
 
@@ -38,6 +39,10 @@ def assert_frames_close(a: FrameAnswer, b: FrameAnswer) -> None:
     assert np.array_equal(a.body_from_cam.translation, b.body_from_cam.translation)
     assert np.abs(a.body_from_cam.rotation - b.body_from_cam.rotation).max() < 5e-9
     assert (a.ned_from_body is None) == (b.ned_from_body is None)
+    assert (a.world_from_body is None) == (b.world_from_body is None)
+    if a.world_from_body is not None and b.world_from_body is not None:
+        assert np.array_equal(a.world_from_body.translation, b.world_from_body.translation)
+        assert np.abs(a.world_from_body.rotation - b.world_from_body.rotation).max() < 5e-9
     if a.ned_from_body is not None and b.ned_from_body is not None:
         assert abs(abs(float(a.ned_from_body @ b.ned_from_body)) - 1.0) < 1e-12
 
@@ -49,6 +54,9 @@ def test_golden_bytes() -> None:
     without = encode_frame(replace(small_frame(), ned_from_body=None))
     assert_golden("frame_answer_no_attitude", without)
     assert decode_frame(without).ned_from_body is None
+    here = replace(small_frame(), world_from_body=small_frame().body_from_cam)
+    assert_golden("frame_answer_with_pose", encode_frame(here))
+    assert_frames_close(decode_frame(encode_frame(here)), here)
 
 
 @given(_frames())

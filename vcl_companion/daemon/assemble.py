@@ -9,6 +9,7 @@ import signal
 import time
 from collections.abc import Coroutine
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -112,7 +113,7 @@ async def _run(config: Config) -> int:
         estimator,
         ExchangeOptions(
             config.swarm,
-            config.map,
+            replace(config.map, patches=config.map.patches and config.pipeline == "default"),
             config.update,
             config.features,
             config.localization.detector,

@@ -47,7 +47,7 @@ from vcl_companion.swarm.transfer import (
     TransferFailed,
     Transfers,
 )
-from vcl_companion.swarm.updates import OwnVote, UpdateOptions
+from vcl_companion.swarm.updates import OwnVote, Sight, UpdateOptions
 from vcl_companion.vision.features import Detector, FeatureOptions
 from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.frame_codec import decode_frame
@@ -123,6 +123,7 @@ class Exchange:
             system_id,
             self._frames,
             autopilot,
+            estimator,
             sensor,
             clock,
             log,
@@ -320,8 +321,10 @@ class Exchange:
         """Look at what we see of the map; whether our vote for an update has changed."""
         stored = self._maps.current
         before = self._wants_update
+        seen = self._estimator
+        sigma_m = seen.sigma_m if seen.tracked else None
         self._wants_update = self._vote.look(
-            stored.revision if stored else b"", self._estimator.tracked, now_s
+            stored.revision if stored else b"", Sight(seen.tracked, seen.covered, sigma_m), now_s
         )
         return self._wants_update != before
 

@@ -12,6 +12,7 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.mapping.drone_view import decode_image
 from vcl_companion.mapping.landmark_map import Keyframe
 from vcl_companion.vision.features import Detector, FeatureOptions, Features, detect
+from vcl_companion.vision.patches import Pyramid, pyramid_of
 
 # About one and a half megabytes each with AKAZE and SIFT; a map has at most two dozen.
 _N_IMAGES = 40
@@ -29,6 +30,7 @@ class FeatureMemory:
         self._options = options
         self._n_images = n_images
         self._known: dict[tuple[bytes, int, int], dict[Detector, Features]] = {}
+        self._pyramids: dict[tuple[bytes, int, int], Pyramid] = {}
 
     def features(self, image_bytes: bytes, camera: Camera, detector: Detector) -> Features:
         """Return what a detector finds in an encoded image.
@@ -44,6 +46,21 @@ class FeatureMemory:
         while len(self._known) > self._n_images:
             del self._known[next(iter(self._known))]
         return known[detector]
+
+    def pyramid(self, image_bytes: bytes, camera: Camera) -> Pyramid:
+        """Return an encoded image at all resolutions.
+
+        Raises:
+            ValueError: it is no image, or not one of this camera.
+        """
+        key = (image_bytes, camera.width_px, camera.height_px)
+        pyramid = self._pyramids.pop(key, None)
+        if pyramid is None:
+            pyramid = pyramid_of(decode_image(image_bytes, camera))
+        self._pyramids[key] = pyramid
+        while len(self._pyramids) > self._n_images:
+            del self._pyramids[next(iter(self._pyramids))]
+        return pyramid
 
     def of_keyframe(
         self, keyframe: Keyframe, detectors: tuple[Detector, ...]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
 from vcl_companion.daemon.companion import ATTITUDE_WAIT_S
+from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.mailbox import PeerMailbox
@@ -23,6 +24,8 @@ from vcl_companion.wire.messages import FrameRequest
 
 _log = logging.getLogger(__name__)
 
+# The frame may be being looked at right now.
+_SETTLE_S = 0.5
 # Only a coordinator asks; while the swarm does not agree who that is there may be two.
 _MAX_ASKERS = 4
 
@@ -52,6 +55,7 @@ class FrameAnswers:
         system_id: this drone.
         frames: our own.
         autopilot: for the attitude that goes with a frame.
+        estimator: for the pose that goes with it.
         sensor: of our camera.
         clock: time base of frames.
         log: told of a frame that cannot be sent.
@@ -66,6 +70,7 @@ class FrameAnswers:
         system_id: int,
         frames: FrameHistory,
         autopilot: AutopilotLink,
+        estimator: Estimator,
         sensor: Sensor,
         clock: Clock,
         log: FlightLog,
@@ -77,6 +82,7 @@ class FrameAnswers:
         self._system_id = system_id
         self._frames = frames
         self._autopilot = autopilot
+        self._estimator = estimator
         self._sensor = sensor
         self._clock = clock
         self._log = log
@@ -137,7 +143,11 @@ class FrameAnswers:
         Raises:
             ValueError: the frame is over an hour old, or cannot be encoded.
         """
-        attitude = await self._autopilot.attitude_at(frame.captured_at_ns, ATTITUDE_WAIT_S)
+        at_ns = frame.captured_at_ns
+        attitude = await self._autopilot.attitude_at(at_ns, ATTITUDE_WAIT_S)
+        if self._estimator.is_localized(self._clock.now_ns()):
+            await self._estimator.looked_at(at_ns, _SETTLE_S)
+        state = self._estimator.own_fix_at(at_ns)
         loop = asyncio.get_running_loop()
         image_bytes = await loop.run_in_executor(
             self._executor, encode_image, frame.image, self._keyframe_quality
@@ -153,4 +163,5 @@ class FrameAnswers:
             body_from_cam=self._sensor.body_from_cam,
             camera=self._sensor.camera,
             image_bytes=image_bytes,
+            world_from_body=None if state is None else state.world_from_body,
         )

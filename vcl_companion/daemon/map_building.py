@@ -10,6 +10,7 @@ from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.reconstruction import reconstruct
 from vcl_companion.mapping.update import extended
+from vcl_companion.vision.features import Features
 from vcl_companion.wire.frame_codec import FrameAnswer
 
 Distances = tuple[tuple[int, int, float], ...]
@@ -64,16 +65,14 @@ def update_map(
         image cannot be used, or that came twice, is left out.
     """
     shown = {(f.drone_id, f.captured_at_ns): f for f in frames}
-    made = [_view(shown[key], map_options, memory) for key in sorted(shown)]
-    views = [view for view in made if isinstance(view, DroneView)]
-    if not views:
-        return NoMap("no frame has come that can be used")
+    views = [_seen(shown[key], ()) for key in sorted(shown)]
     return extended(
         stored.index.landmark_map,
         stored.revision,
         views,
-        lambda keyframe: memory.of_keyframe(keyframe, map_options.detectors),
+        memory.features,
         map_options,
+        pyramid_of=memory.pyramid,
     )
 
 
@@ -86,6 +85,10 @@ def _view(frame: FrameAnswer, map_options: MapOptions, memory: FeatureMemory) ->
         )
     except ValueError as error:
         return NoMap(str(error))
+    return _seen(frame, features)
+
+
+def _seen(frame: FrameAnswer, features: tuple[Features, ...]) -> DroneView:
     attitude = frame.ned_from_body
     return DroneView(
         frame.drone_id,
@@ -95,4 +98,5 @@ def _view(frame: FrameAnswer, map_options: MapOptions, memory: FeatureMemory) ->
         None if attitude is None else matrix_from_quaternion(attitude),
         frame.image_bytes,
         features,
+        frame.world_from_body,
     )

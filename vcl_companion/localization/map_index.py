@@ -15,8 +15,8 @@ from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
 from vcl_companion.vision.features import Detector, FeatureOptions, Features, detect
 
-# Landmarks lie where the detector put them, up to the rounding of the wire format.
-_SAME_PX = 0.1
+# Patches say better than the detector where its features are.
+_SAME_PX = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,12 +68,12 @@ class Correspondences:
         for i, one in joined.items():
             cam = one.world_from_body @ self._views[i].body_from_cam
             visible = self._visible(known, i, cam)
-            overlap = [
-                _overlap(known.points_world[visible & known.seen[:, k]], cam, origin)
+            overlaps = [
+                overlap(known.points_world[visible & known.seen[:, k]], cam, origin)
                 for k, origin in enumerate(origins)
             ]
-            for k in np.argsort(overlap)[::-1][:_PARTNERS]:
-                if overlap[k] > 0.0:
+            for k in np.argsort(overlaps)[::-1][:_PARTNERS]:
+                if overlaps[k] > 0.0:
                     self.with_keyframe(int(k), i)
         self.match_views(known, joined)
 
@@ -100,12 +100,12 @@ class Correspondences:
         cams = {i: one.world_from_body @ self._views[i].body_from_cam for i, one in joined.items()}
         visible = {i: self._visible(known, i, cam) for i, cam in cams.items()}
         for i in cams:
-            overlap = {
-                k: _overlap(known.points_world[visible[i] & visible[k]], cams[i], cams[k])
+            overlaps = {
+                k: overlap(known.points_world[visible[i] & visible[k]], cams[i], cams[k])
                 for k in cams
                 if k != i
             }
-            best = sorted(overlap, key=lambda k: -overlap[k])[:_PARTNERS]
+            best = sorted(overlaps, key=lambda k: -overlaps[k])[:_PARTNERS]
             pairs |= {(min(i, k), max(i, k)) for k in best}
         return sorted(pairs)
 
@@ -155,7 +155,7 @@ def unique(links: PairMatches) -> PairMatches:
     return PairMatches(pairs[:, 0], pairs[:, 1])
 
 
-def _overlap(points: Array, one: Pose, other: Pose) -> float:
+def overlap(points: Array, one: Pose, other: Pose) -> float:
     """Return how many points two cameras share, counted by the angle they are seen under."""
     a, b = points - one.translation, points - other.translation
     lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)

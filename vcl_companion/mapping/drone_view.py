@@ -26,6 +26,7 @@ class DroneView:
         ned_from_body: (3, 3) attitude from its autopilot at that instant, or None.
         image_bytes: the encoded image, as exchanged.
         features: found in that image, one set for each detector the builder uses.
+        world_from_body: where the drone's own localization on the map puts it, or None.
     """
 
     drone_id: int
@@ -35,6 +36,7 @@ class DroneView:
     ned_from_body: Array | None
     image_bytes: bytes
     features: tuple[Features, ...]
+    world_from_body: Pose | None = None
 
     @property
     def pixels(self) -> Array:

@@ -102,7 +102,7 @@ def grown(
         replace(k, world_from_body=body)
         for k, body in zip(old.keyframes, estimate.bodies, strict=False)
     ) + tuple(
-        _keyframe(views[i], estimate.bodies[len(old.keyframes) + n]) for n, i in enumerate(chosen)
+        keyframe_of(views[i], estimate.bodies[len(old.keyframes) + n]) for n, i in enumerate(chosen)
     )
     number = np.where(good, np.cumsum(good) - 1, -1)
     return Growth(
@@ -121,7 +121,8 @@ def grown(
     )
 
 
-def _keyframe(view: DroneView, world_from_body: Pose) -> Keyframe:
+def keyframe_of(view: DroneView, world_from_body: Pose) -> Keyframe:
+    """Return what a view is as a part of a map."""
     return Keyframe(
         view.drone_id,
         view.captured_at_ns,

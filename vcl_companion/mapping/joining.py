@@ -73,7 +73,7 @@ def join(
     start = search(sightings, wanted)
     if isinstance(start, NotFound):
         return start
-    return _believed(view, links, refine(start, sightings, wanted), known, sure, options)
+    return believed(view, links, refine(start, sightings, wanted), known, sure, options)
 
 
 def join_nearby(
@@ -104,7 +104,7 @@ def join_nearby(
     result = refine(
         guess, sightings_of(view, links, known, sure), ResectionOptions(min_inliers=_MIN_INLIERS)
     )
-    return _believed(view, links, result, known, sure, options)
+    return believed(view, links, result, known, sure, options)
 
 
 def sightings_of(
@@ -143,7 +143,7 @@ def contradiction(view: DroneView, world_from_body: Pose, options: MapOptions) -
     return ""
 
 
-def _believed(
+def believed(
     view: DroneView,
     links: PairMatches,
     found: Resection | NotFound,
@@ -151,6 +151,7 @@ def _believed(
     sure: MapUncertainty,
     options: MapOptions,
 ) -> Joined | NotFound:
+    """Return a view at a pose found, unless that is too vague or contradicts its attitude."""
     if isinstance(found, NotFound):
         return found
     kept = PairMatches(links.a[found.inliers], links.b[found.inliers])

@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.drone_view import decode_image
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.vision.features import Detector, FeatureOptions, Features, detect
 
 Index = NDArray[np.intp]
 FeaturesOf = Callable[[Keyframe], tuple[Features, ...]]
 
-# Landmarks lie where the detector put them, up to the rounding of the wire format.
-_SAME_PX = 0.1
+# Patches say better than the detector where its features are.
+_SAME_PX = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,18 +36,20 @@ class KnownFeatures:
     landmark: Index
 
 
-def detected(detectors: tuple[Detector, ...], options: FeatureOptions) -> FeaturesOf:
-    """Return what finds a keyframe's features in its image; none where it is no image."""
+def of_keyframes(
+    features_of: Callable[[bytes, Camera, Detector], Features], detectors: tuple[Detector, ...]
+) -> FeaturesOf:
+    """Return what finds a keyframe's features; none where its image is none."""
 
-    def features_of(keyframe: Keyframe) -> tuple[Features, ...]:
+    def found(keyframe: Keyframe) -> tuple[Features, ...]:
         try:
-            image = decode_image(keyframe.image_bytes, keyframe.camera)
+            return tuple(features_of(keyframe.image_bytes, keyframe.camera, d) for d in detectors)
         except ValueError:
             # A map may come from a peer; what it shows nothing of, nothing is matched with.
-            image = np.zeros((1, 1), np.uint8)
-        return tuple(detect(image, detector, options) for detector in detectors)
+            nothing = np.zeros((1, 1), np.uint8)
+            return tuple(detect(nothing, d, FeatureOptions()) for d in detectors)
 
-    return features_of
+    return found
 
 
 class KeyframeLibrary:

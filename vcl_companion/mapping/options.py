@@ -22,6 +22,8 @@ class MapOptions:
         distance_sigma_m: how well the known distances are known, 1 sigma.
         max_depth_error: relative depth error, 1 sigma, median over the landmarks,
             above which the map is refused; twice that and a landmark is left out.
+        patches: observations are measured again by patches; without, as the detectors say.
+        landmarks_per_cell: of a map of patches, in each of 16 x 12 cells of an image.
         max_keyframes: an extended map keeps at most this many.
         max_landmarks: and at most this many landmarks.
         member_wait_s: how long a first map waits for members that are not there yet.
@@ -37,6 +39,8 @@ class MapOptions:
     attitude_sigma_deg: float = 4.0
     distance_sigma_m: float = 0.01
     max_depth_error: float = 0.1
+    patches: bool = True
+    landmarks_per_cell: int = 4
     max_keyframes: int = 24
     max_landmarks: int = 12_000
     member_wait_s: float = 10.0
@@ -48,6 +52,8 @@ class MapOptions:
             raise ValueError(f"keyframe_quality must lie in 1..100, got {self.keyframe_quality}")
         if self.min_landmarks < 20:
             raise ValueError(f"min_landmarks must be at least 20, got {self.min_landmarks}")
+        if self.landmarks_per_cell < 1:
+            raise ValueError(f"landmarks_per_cell must be positive, got {self.landmarks_per_cell}")
         if not 4 <= self.max_keyframes <= 64:
             raise ValueError(f"max_keyframes must lie in 4..64, got {self.max_keyframes}")
         if not self.min_landmarks <= self.max_landmarks <= 16_000:

@@ -14,6 +14,8 @@ from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.scale import metric
 from vcl_companion.mapping.scene import grown_from
+from vcl_companion.mapping.sharpening import sharpened
+from vcl_companion.mapping.thinning import thinned
 from vcl_companion.mapping.tracks import pixels_of_tracks
 from vcl_companion.mapping.uncertainty import map_uncertainty
 from vcl_companion.mapping.visibility import Edge, visibility_graph
@@ -77,7 +79,15 @@ def _build(
     scene, tracks = grown_from(drones, pair, chosen.b_from_a, matches, options)
     observed = pixels_of_tracks(tracks, [d.pixels for d in drones])
     made = metric(drones, scene, observed, distances_m, options)
-    return accepted(made, options) if isinstance(made, LandmarkMap) else made
+    if isinstance(made, NoMap):
+        return made
+    # Patches from far apart may not resemble each other enough: then the features have to do.
+    if options.patches:
+        sharp = thinned(sharpened(made, options), options.landmarks_per_cell)
+        better = accepted(sharp, options)
+        if isinstance(better, LandmarkMap):
+            return better
+    return accepted(made, options)
 
 
 def accepted(landmark_map: LandmarkMap, options: MapOptions) -> LandmarkMap | NoMap:

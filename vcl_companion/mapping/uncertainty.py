@@ -9,6 +9,7 @@ average out over landmarks or frames and is what fusing must not forget.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,12 +24,11 @@ from vcl_companion.vision.schur import eliminated
 # Smallest eigenvalue of an information matrix with ones on its diagonal; eliminating
 # landmarks of little parallax leaves 1e-12 by rounding.
 _SINGULAR = 1e-11
-# A detector misplaces a feature alike in images taken from nearly the same place, so that
-# residuals (0.2 to 0.4 px) tell too little: NEES of keyframes, 6 degrees of freedom, was 10 to
-# 53 by them, 1 to 8 by half a pixel (up to 44 on photographs). By half a pixel, though, the
-# median NEES of poses was 1.2 to 5.6 over nine recordings, expected 5.35: a little less is true.
-# What localization takes as well.
-NOISE_FLOOR_PX = 0.4
+# What displaces a feature or a patch is alike in neighbouring ones, so that residuals tell too
+# little of it: it acts on keyframes like so much more independent noise. NEES of keyframes
+# after several extensions, 6 degrees of freedom: 0.6 to 16 on rendered flights (median 5),
+# up to 60 on photographs: still too sure there.
+SHARED_NOISE_PX = 0.4
 # No distance between drones is known better; much smaller sigmas overflow.
 _FINEST_M = 1e-6
 
@@ -85,7 +85,7 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
     with np.errstate(all="ignore"):
         views = views_of(landmark_map)
         # Distances enter in units of their own sigma; pixels in px: bring both to sigmas.
-        noise_px = max(landmark_map.pixel_noise_px, NOISE_FLOOR_PX)
+        noise_px = math.hypot(landmark_map.pixel_noise_px, SHARED_NOISE_PX)
         scaled = replace(views, slopes=views.slopes / noise_px)
         system = normal_equations(scaled, None)
         inverse = _inverse(system.point_block)

@@ -11,19 +11,23 @@ from dataclasses import replace
 
 import numpy as np
 
+from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.pose import Pose
 from vcl_companion.mapping.continuity import broken_continuity, pruned
 from vcl_companion.mapping.correspondences import Correspondences, unique
-from vcl_companion.mapping.drone_view import DroneView
+from vcl_companion.mapping.drone_view import DroneView, decode_image
+from vcl_companion.mapping.extension import Extension, ImageFeatures
 from vcl_companion.mapping.growth import Growth, grown
 from vcl_companion.mapping.joining import Joined, join, join_nearby
-from vcl_companion.mapping.known_features import FeaturesOf, KeyframeLibrary, detected
+from vcl_companion.mapping.known_features import KeyframeLibrary, of_keyframes
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.late_joining import join_together
 from vcl_companion.mapping.options import MapOptions, NoMap
+from vcl_companion.mapping.patch_table import PyramidOf, decoded_pyramid
 from vcl_companion.mapping.reconstruction import accepted
 from vcl_companion.mapping.tracks import PairMatches
 from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
-from vcl_companion.vision.features import FeatureOptions
+from vcl_companion.vision.features import Detector, FeatureOptions, Features, detect
 
 # Keyframes that a view is matched with before it is given up.
 _TRIED = 6
@@ -55,7 +59,11 @@ def extend_map(
         The old map with the views that could be registered and what they see,
         or why there is none.
     """
-    features_of = detected(options.detectors, features or FeatureOptions())
+    chosen = features or FeatureOptions()
+
+    def features_of(image_bytes: bytes, camera: Camera, detector: Detector) -> Features:
+        return detect(decode_image(image_bytes, camera), detector, chosen)
+
     return extended(old, parent, views, features_of, options, seed)
 
 
@@ -63,11 +71,16 @@ def extended(
     old: LandmarkMap,
     parent: bytes,
     views: list[DroneView],
-    features_of: FeaturesOf,
+    features_of: ImageFeatures,
     options: MapOptions,
     seed: int = 0,
+    pyramid_of: PyramidOf = decoded_pyramid,
 ) -> LandmarkMap | NoMap:
-    """Do what ``extend_map`` does, with any source of the old keyframes' features."""
+    """Do what ``extend_map`` does, with any source of features and images.
+
+    Views that say where they are are joined by patches. Those that do not, or are not
+    there, are registered by their features, on what the others have made of the map.
+    """
     known = {(k.drone_id, k.captured_at_ns) for k in old.keyframes}
     views = [v for v in views if (v.drone_id, v.captured_at_ns) not in known]
     if not views:
@@ -76,15 +89,79 @@ def extended(
         sure = map_uncertainty(old)
     except ValueError as error:
         return NoMap(str(error))
-    update = _Update(old, sure, views, KeyframeLibrary(old, features_of), options, seed)
-    growth = update.run()
-    if isinstance(growth, NoMap):
-        return growth
+    growth: Growth | None = None
+    if options.patches:
+        views = _guessed(old, sure, views, features_of, options, seed)
+        extension = Extension(old, sure, views, features_of, pyramid_of, options)
+        growth = extension.run()
+    if growth is None or len(growth.views) < len(views):
+        late = _by_features(old, growth, views, features_of, options, seed)
+        if isinstance(late, Growth):
+            growth = late
+        elif growth is None:
+            return late
     reason = broken_continuity(old, sure, growth)
     if reason:
         return NoMap(reason)
     made = pruned(replace(growth.landmark_map, parent=parent), len(old.keyframes), options)
     return accepted(made, options)
+
+
+def _guessed(
+    old: LandmarkMap,
+    sure: MapUncertainty,
+    views: list[DroneView],
+    features_of: ImageFeatures,
+    options: MapOptions,
+    seed: int,
+) -> list[DroneView]:
+    """Return the views, with poses by features for those that do not say where they are."""
+    out = list(views)
+    # The second detector costs as much again, and sees from farther apart.
+    for detectors in dict.fromkeys((options.detectors[:1], options.detectors)):
+        library = KeyframeLibrary(old, of_keyframes(features_of, detectors))
+        for i, view in enumerate(out):
+            if view.world_from_body is not None:
+                continue
+            try:
+                found = tuple(features_of(view.image_bytes, view.camera, d) for d in detectors)
+            except ValueError:
+                continue
+            shown = replace(view, features=found)
+            pose = _Update(old, sure, [shown], library, options, seed).pose_on_old()
+            out[i] = replace(view, world_from_body=pose)
+    return out
+
+
+def _by_features(
+    old: LandmarkMap,
+    growth: Growth | None,
+    views: list[DroneView],
+    features_of: ImageFeatures,
+    options: MapOptions,
+    seed: int,
+) -> Growth | NoMap:
+    """Register views that have not joined, by their features."""
+    known = growth.landmark_map if growth else old
+    waiting = [v for i, v in enumerate(views) if growth is None or i not in growth.views]
+    usable = []
+    for view in waiting:
+        try:
+            found = tuple(features_of(view.image_bytes, view.camera, d) for d in options.detectors)
+        except ValueError:
+            continue
+        usable.append(replace(view, features=found))
+    if not usable:
+        return NoMap("no frame has come that can be used")
+    try:
+        sure = map_uncertainty(known)
+    except ValueError as error:
+        return NoMap(str(error))
+    library = KeyframeLibrary(known, of_keyframes(features_of, options.detectors))
+    late = _Update(known, sure, usable, library, options, seed).run()
+    if growth is None or isinstance(late, NoMap):
+        return late
+    return replace(late, old=np.where(late.old >= 0, growth.old[late.old], -1))
 
 
 class _Update:
@@ -142,6 +219,11 @@ class _Update:
         if growth is None:
             return NoMap("no new view fits the map: " + "; ".join(self._told()))
         return growth
+
+    def pose_on_old(self) -> Pose | None:
+        """Return where the only view is by old landmarks; None where these do not say."""
+        self._join_old(0)
+        return self._joined[0].world_from_body if self._joined else None
 
     def _told(self) -> list[str]:
         return [f"drone {self._views[i].drone_id}: {r}" for i, r in sorted(self._reasons.items())]

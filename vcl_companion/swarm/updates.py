@@ -1,8 +1,17 @@
 """When the map is to be updated (IV-G): each drone's vote, and the coordinator's patience.
 
 No clock and no socket: the owner says what time it is. A drone votes for an
-update when it sees too few landmarks; when the majority of the members alive
-does, the coordinator makes one.
+update when one of these holds for the median of its last second:
+
+* landmarks in sight < max(``tracked``, ``share`` x most since this revision);
+* covered share of the image < min(``covered``, 0.8 x most since this revision):
+  sky is never covered, and no reason to update again and again;
+* 1-sigma of the position > max(``sigma_m``, ``sigma_growth`` x least since this
+  revision): what is known no better than that only gets worse, and is
+  inherited by whatever is added to the map later.
+
+When the majority of the members alive votes so, the coordinator makes one. A
+drone alone is the majority.
 """
 
 from __future__ import annotations
@@ -18,6 +27,8 @@ from vcl_companion.swarm.group import Group
 _WINDOW_S = 1.0
 # A new map is not judged by less than this share of the window.
 _JUDGED_SHARE = 0.5
+# A view that is never covered more, by sky perhaps, is no reason to update.
+_STILL_COVERED = 0.8
 # An update that did not help is followed by a longer pause, up to so many intervals.
 _MAX_PAUSE = 8.0
 
@@ -30,6 +41,10 @@ class UpdateOptions:
         tracked: a drone that sees fewer landmarks of the map wants it updated.
         share: so does one that sees less than this share of the most that it
             has seen of this revision; 0 for both of them: maps stay as they are.
+        covered: share of the image that the map has to fill.
+        sigma_m: positions better than this are good enough.
+        sigma_growth: above that, a drone wants an update when its position is known
+            so many times worse than it was at best on this revision.
         hold_s: how long the majority has to want it.
         interval_s: shortest time from the end of one round, or from a new revision,
             to the next round; up to eight times as long while rounds do not help.
@@ -48,6 +63,9 @@ class UpdateOptions:
     # Beside its own keyframe a map is seen half as well again as from anywhere else, so half
     # of the most is two thirds of what is usual: it has to be early, for the same reason.
     share: float = 0.5
+    covered: float = 0.6
+    sigma_m: float = 0.01
+    sigma_growth: float = 2.0
     hold_s: float = 0.5
     interval_s: float = 2.0
     gather_timeout_s: float = 5.0
@@ -61,7 +79,12 @@ class UpdateOptions:
             raise ValueError(f"tracked must not be negative, got {self.tracked}")
         if not 0 <= self.share < 1:
             raise ValueError(f"share must lie in [0, 1), got {self.share}")
+        if not 0 <= self.covered < 1:
+            raise ValueError(f"covered must lie in [0, 1), got {self.covered}")
+        if not self.sigma_growth > 1:
+            raise ValueError(f"sigma_growth must be more than 1, got {self.sigma_growth}")
         for name in (
+            "sigma_m",
             "hold_s",
             "interval_s",
             "gather_timeout_s",
@@ -76,23 +99,40 @@ class UpdateOptions:
             raise ValueError(f"joiner_frames must lie in 1..8, got {self.joiner_frames}")
 
 
+@dataclass(frozen=True)
+class Sight:
+    """What a drone sees of the map in one frame.
+
+    Attributes:
+        tracked: landmarks of the map in sight, 0 without a pose.
+        covered: share of the image that they fill; None where nobody has looked.
+        sigma_m: of the position by them, in its worst direction; None without a pose.
+    """
+
+    tracked: int
+    covered: float | None = None
+    sigma_m: float | None = None
+
+
 class OwnVote:
     """Whether this drone wants its map updated, by what it has seen of it lately."""
 
     def __init__(self, options: UpdateOptions) -> None:
         self._options = options
         self._revision = b""
-        self._seen: deque[tuple[float, int]] = deque()
+        self._seen: deque[tuple[float, Sight]] = deque()
         self._since_s = 0.0
         self._most = 0.0
+        self._most_covered = 0.0
+        self._least_sigma_m = math.inf
         self._wants = False
 
-    def look(self, revision: bytes, tracked: int, now_s: float) -> bool:
+    def look(self, revision: bytes, sight: Sight, now_s: float) -> bool:
         """Take in what is seen now; call it several times a second.
 
         Args:
             revision: of the map in use; empty for none.
-            tracked: landmarks that agreed on the last frame's pose, 0 without a pose.
+            sight: of it.
             now_s: not before the last call's.
 
         Returns:
@@ -103,17 +143,38 @@ class OwnVote:
             self._revision = revision
             self._seen.clear()
             self._since_s = now_s
-            self._most = 0.0
-        self._seen.append((now_s, tracked))
+            self._most = self._most_covered = 0.0
+            self._least_sigma_m = math.inf
+        self._seen.append((now_s, sight))
         while self._seen[0][0] < now_s - _WINDOW_S:
             self._seen.popleft()
-        if not revision:
+        if not revision or not (self._options.tracked or self._options.share):
             self._wants = False
         elif now_s - self._since_s >= _JUDGED_SHARE * _WINDOW_S:
-            lately = statistics.median(n for _, n in self._seen)
-            self._most = max(self._most, lately)
-            self._wants = lately < max(self._options.tracked, self._options.share * self._most)
+            self._wants = self._is_little() or self._is_narrow() or self._is_vague()
         return self._wants
+
+    def _is_little(self) -> bool:
+        lately = statistics.median(s.tracked for _, s in self._seen)
+        self._most = max(self._most, lately)
+        return lately < max(self._options.tracked, self._options.share * self._most)
+
+    def _is_narrow(self) -> bool:
+        known = [s.covered for _, s in self._seen if s.covered is not None]
+        if not known:
+            return False
+        lately = statistics.median(known)
+        self._most_covered = max(self._most_covered, lately)
+        return lately < min(self._options.covered, _STILL_COVERED * self._most_covered)
+
+    def _is_vague(self) -> bool:
+        known = [s.sigma_m for _, s in self._seen if s.sigma_m is not None]
+        if not known:
+            return False
+        lately_m = statistics.median(known)
+        self._least_sigma_m = min(self._least_sigma_m, lately_m)
+        growth = self._options.sigma_growth
+        return lately_m > max(self._options.sigma_m, growth * self._least_sigma_m)
 
 
 class UpdateTrigger:

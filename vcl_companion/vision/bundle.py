@@ -15,7 +15,7 @@ from scipy.special import gammaincinv
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, skew
-from vcl_companion.vision.schur import eliminated
+from vcl_companion.vision import bundle_kernels as kernels
 
 _MIN_DEPTH_M = 1e-3
 
@@ -59,10 +59,12 @@ class BundleOptions:
     Attributes:
         max_iterations: Levenberg-Marquardt steps.
         cauchy_px: residual at which an observation's weight has fallen to one half.
+        least_gain: of the cost, relative; a step that brings less is the last.
     """
 
     max_iterations: int = 40
     cauchy_px: float = 1.5
+    least_gain: float = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,26 +113,93 @@ def adjust(views: Views, options: BundleOptions) -> tuple[Views, float]:
         sigma, px, from the median absolute residual).
     """
     damping = 1e-4
-    system = normal_equations(views, options.cauchy_px)
+    problem = _Problem(views, options.cauchy_px)
+    system, cost = problem.system(views, damping), problem.cost(views)
     for _ in range(options.max_iterations):
-        step = _solve(system, damping)
-        if step is None:
-            damping *= 10.0
-            if damping > 1e8:
-                break
-            continue
-        candidate = _moved(views, *step)
-        new_system = normal_equations(candidate, options.cauchy_px)
-        if new_system.cost < system.cost:
-            converged = system.cost - new_system.cost < 1e-7 * system.cost
-            views, system, damping = candidate, new_system, max(damping / 5.0, 1e-9)
-            if converged:
-                break
-        else:
-            damping *= 6.0
-            if damping > 1e8:
-                break
+        step = problem.step(system, damping)
+        if step is not None:
+            candidate = _moved(views, *step)
+            new_cost = problem.cost(candidate)
+            if new_cost < cost:
+                converged = cost - new_cost < options.least_gain * cost
+                views, cost, damping = candidate, new_cost, max(damping / 5.0, 1e-9)
+                if converged:
+                    break
+                system = problem.system(views, damping)
+                continue
+        damping *= 6.0
+        if damping > 1e8:
+            break
+        system = problem.system(views, damping)
     return views, residual_noise_px(reprojection_residuals(views))
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    """The reduced system at one estimate, and what leads from poses to landmarks."""
+
+    normal: Array
+    rhs: Array
+    diagonal: Array
+    inverses: Array
+    pulls: Array
+    crosses: Array
+
+
+class _Problem:
+    """The observations of one adjustment, landmark by landmark, as the compiled loops read them."""
+
+    def __init__(self, views: Views, cauchy_px: float) -> None:
+        seen = np.isfinite(views.ideal[:, :, 0])
+        owner, view = np.nonzero(seen)
+        self._first = np.searchsorted(owner, np.arange(len(views.points) + 1)).astype(np.int64)
+        self._view = view.astype(np.int64)
+        self._slopes = np.ascontiguousarray(views.slopes[seen])
+        self._ideal = np.ascontiguousarray(views.ideal[seen])
+        self._mountings = _matrices(views.mountings)
+        self._cauchy_px = cauchy_px
+
+    def cost(self, views: Views) -> float:
+        """Return the robust cost, px^2 (distances weighted to the same unit)."""
+        by_distance = sum(_add_distance(views, d, None, None) for d in views.distances)
+        return by_distance + kernels.cost_of(*self._arguments(views), self._cauchy_px)
+
+    def system(self, views: Views, damping: float) -> _System:
+        """Linearise at an estimate."""
+        system = _System(*kernels.reduced(*self._arguments(views), self._cauchy_px, damping))
+        before = np.diag(system.normal).copy()
+        for known in views.distances:
+            _add_distance(views, known, system.normal, system.rhs)
+        return replace(system, diagonal=system.diagonal + np.diag(system.normal) - before)
+
+    def step(self, system: _System, damping: float) -> tuple[Array, Array] | None:
+        """Return the damped (6V,) pose step and (N, 3) point step; None where singular."""
+        free = slice(6, len(system.rhs))
+        damped = system.normal[free, free] + damping * np.diag(system.diagonal[free])
+        pose_step = np.zeros(len(system.rhs))
+        try:
+            pose_step[free] = np.linalg.solve(damped, system.rhs[free])
+        except np.linalg.LinAlgError:
+            return None
+        point_step = kernels.substituted(
+            pose_step, self._first, self._view, system.inverses, system.pulls, system.crosses
+        )
+        if not (np.all(np.isfinite(pose_step)) and np.all(np.isfinite(point_step))):
+            return None
+        return pose_step, point_step
+
+    def _arguments(
+        self, views: Views
+    ) -> tuple[Array, Array, Array, kernels.Ints, kernels.Ints, Array, Array]:
+        points = np.ascontiguousarray(views.points)
+        bodies = _matrices(views.bodies)
+        return (
+            points, bodies, self._mountings, self._first, self._view, self._slopes, self._ideal
+        )  # fmt: skip
+
+
+def _matrices(poses: tuple[Pose, ...]) -> Array:
+    return np.ascontiguousarray(np.stack([pose.matrix()[:3] for pose in poses]))
 
 
 def residual_noise_px(residuals: Array) -> float:
@@ -237,42 +306,23 @@ def _robust(residual: Array, cauchy_px: float | None) -> tuple[Array, float]:
     return 1.0 / (1.0 + scaled), float(cauchy_px**2 * np.log1p(scaled).sum())
 
 
-def _add_distance(views: Views, known: Distance, pose_block: Array, pose_rhs: Array) -> float:
+def _add_distance(
+    views: Views, known: Distance, pose_block: Array | None, pose_rhs: Array | None
+) -> float:
+    """Return the cost of a distance; add it to a normal matrix and its right side."""
     a, b = views.bodies[known.a], views.bodies[known.b]
     offset = a.translation - b.translation
     length = max(float(np.linalg.norm(offset)), 1e-9)
+    error = (length - known.distance_m) / known.sigma_m
+    if pose_block is None or pose_rhs is None:
+        return error**2
     jacobian = np.zeros(len(pose_rhs))
     jacobian[6 * known.a : 6 * known.a + 3] = offset / length @ a.rotation
     jacobian[6 * known.b : 6 * known.b + 3] = -offset / length @ b.rotation
-    error = (length - known.distance_m) / known.sigma_m
     jacobian /= known.sigma_m
     pose_block += np.outer(jacobian, jacobian)
     pose_rhs -= jacobian * error
     return error**2
-
-
-def _solve(system: NormalEquations, damping: float) -> tuple[Array, Array] | None:
-    """Return the damped (6V,) pose step and (N, 3) point step; None where singular."""
-    point_block = system.point_block.copy()
-    diagonal = np.arange(3)
-    point_block[:, diagonal, diagonal] *= 1.0 + damping
-    point_block[:, diagonal, diagonal] += 1e-9
-    try:
-        inverse = np.asarray(np.linalg.inv(point_block), dtype=np.float64)
-        reduced = system.pose_block - eliminated(system.cross, inverse, system.seen)
-        toward = np.einsum("nij,nj->ni", inverse, system.point_rhs)
-        rhs = system.pose_rhs - np.einsum("nij,nj->i", system.cross, toward)
-        free = slice(6, len(rhs))
-        damped = reduced[free, free] + damping * np.diag(np.diag(system.pose_block)[free])
-        pose_step = np.zeros(len(rhs))
-        pose_step[free] = np.linalg.solve(damped, rhs[free])
-    except np.linalg.LinAlgError:
-        return None
-    back = system.point_rhs - np.einsum("nij,i->nj", system.cross, pose_step)
-    point_step = np.einsum("nij,nj->ni", inverse, back)
-    if not (np.all(np.isfinite(pose_step)) and np.all(np.isfinite(point_step))):
-        return None
-    return pose_step, point_step
 
 
 def _moved(views: Views, pose_step: Array, point_step: Array) -> Views:

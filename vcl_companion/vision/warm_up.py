@@ -10,8 +10,10 @@ import numpy as np
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
 from vcl_companion.vision import pose_kernels
 from vcl_companion.vision.absolute_pose import resect
+from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust
 from vcl_companion.vision.patches import (
     AlignRules,
     Anchors,
@@ -24,6 +26,7 @@ from vcl_companion.vision.patches import (
 )
 from vcl_companion.vision.relative_pose import essential_candidates
 from vcl_companion.vision.schur import eliminated
+from vcl_companion.vision.surface_kernels import inclinations
 
 
 def warm_up() -> None:
@@ -35,7 +38,27 @@ def warm_up() -> None:
     essential_candidates(ideal_a, ideal_b, 320.0, rng)
     resect(ideal_b, points, 320.0, rng)
     eliminated(np.zeros((1, 6, 3)), np.zeros((1, 3, 3)), np.ones((1, 1), dtype=np.bool_))
+    _adjust(points)
     _track(rng)
+
+
+def _adjust(points: Array) -> None:
+    """Adjust two views of points, and fit planes to these."""
+    bodies = (Pose.identity(), Pose(np.eye(3), np.array([1.0, 0.2, 0.1])))
+    ideal = np.stack([(points - b.translation)[:, :2] / points[:, 2:] for b in bodies], axis=1)
+    views = Views(
+        bodies=bodies,
+        mountings=(Pose.identity(),) * 2,
+        slopes=np.tile(320.0 * np.eye(2), (len(points), 2, 1, 1)),
+        ideal=ideal,
+        points=points,
+        distances=(Distance(0, 1, 1.0, 0.01),),
+    )
+    adjust(views, BundleOptions(max_iterations=2))
+    n = len(points)
+    near = np.tile(np.arange(4, dtype=np.int64), (n, 1))
+    depth, far = points[:, 2], np.ones((n, 4))
+    inclinations(np.ascontiguousarray(ideal[:, 0]), 1.0 / depth, 0.01 / depth, near, far, 40.0, 1.0)
 
 
 def _track(rng: np.random.Generator) -> None:

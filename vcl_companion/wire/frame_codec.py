@@ -37,9 +37,11 @@ from vcl_companion.wire.reader import Reader
 # | 3  | u32 | request id                                                     |
 # | 7  | u64 | captured at, ns, the sender's own clock, below 2^63            |
 # | 15 | f64 | age of the frame when it was sent, s                           |
-# | 23 | u8  | 1: an attitude follows, 0: none                                |
-# | 24 | rotation ned_from_body if so, pose body_from_cam, camera, image: see pose_codec |
+# | 23 | u8  | what follows, a sum: 1 an attitude, 2 the drone's own pose     |
+# | 24 | rotation ned_from_body if so, pose world_from_body if so, pose body_from_cam, camera, |
+# |    | image: see pose_codec                                                                 |
 _HEAD = struct.Struct("<BIQdB")
+_HAS_ATTITUDE, _HAS_POSE = 1, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +58,8 @@ class FrameAnswer:
         body_from_cam: its camera's mounting.
         camera: its camera's intrinsics.
         image_bytes: the encoded image (WebP).
+        world_from_body: where that drone believes that it was, on the map that it
+            flew on; None when it does not know.
     """
 
     drone_id: int
@@ -66,6 +70,7 @@ class FrameAnswer:
     body_from_cam: Pose
     camera: Camera
     image_bytes: bytes
+    world_from_body: Pose | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.drone_id <= 255 or not 0 <= self.captured_at_ns < 1 << 63:
@@ -99,6 +104,7 @@ def encode_frame_body(frame: FrameAnswer) -> bytes:
         ValueError: see ``encode_frame``.
     """
     attitude = b"" if frame.ned_from_body is None else encode_rotation(frame.ned_from_body)
+    pose = b"" if frame.world_from_body is None else encode_pose(frame.world_from_body)
     return b"".join(
         [
             _HEAD.pack(
@@ -106,9 +112,10 @@ def encode_frame_body(frame: FrameAnswer) -> bytes:
                 frame.request_id,
                 frame.captured_at_ns,
                 frame.frame_age_s,
-                frame.ned_from_body is not None,
+                _HAS_ATTITUDE * bool(attitude) + _HAS_POSE * bool(pose),
             ),
             attitude,
+            pose,
             encode_pose(frame.body_from_cam),
             encode_camera(frame.camera),
             encode_image(frame.image_bytes),
@@ -135,10 +142,11 @@ def decode_frame(data: bytes) -> FrameAnswer:
 
 def take_frame_body(reader: Reader) -> FrameAnswer:
     """Return the frame that comes next, or raise WireError."""
-    drone_id, request_id, captured_at_ns, age_s, has_attitude = reader.unpack(_HEAD)
-    if has_attitude > 1:
-        raise WireError(f"frame answer: attitude flag {has_attitude}")
-    attitude = take_rotation(reader) if has_attitude else None
+    drone_id, request_id, captured_at_ns, age_s, has = reader.unpack(_HEAD)
+    if has > _HAS_ATTITUDE + _HAS_POSE:
+        raise WireError(f"frame answer: unknown contents {has}")
+    attitude = take_rotation(reader) if has & _HAS_ATTITUDE else None
+    world_from_body = take_pose(reader) if has & _HAS_POSE else None
     body_from_cam, camera = take_pose(reader), take_camera(reader)
     image_bytes = take_image(reader)
     try:
@@ -151,6 +159,7 @@ def take_frame_body(reader: Reader) -> FrameAnswer:
             body_from_cam,
             camera,
             image_bytes,
+            world_from_body,
         )
     except ValueError as error:
         raise WireError(f"frame answer: {error}") from None

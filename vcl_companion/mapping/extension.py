@@ -1,0 +1,308 @@
+"""A map extended by views whose place on it is known already, all by patches (IV-G, issue 4).
+
+Old landmarks are found in the new views by their patches, new ones across the
+new views and the keyframes that overlap them most, one drone's own earlier ones
+among these; then old and new are adjusted together, measured again from the
+adjusted poses, and adjusted a last time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.mapping.correspondences import overlap
+from vcl_companion.mapping.culling import Mask, depth_errors, fitting, placed
+from vcl_companion.mapping.drone_view import DroneView
+from vcl_companion.mapping.growth import Growth, keyframe_of
+from vcl_companion.mapping.known_features import Index
+from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
+from vcl_companion.mapping.new_landmarks import Shown, free_of, new_landmarks, shown, with_room
+from vcl_companion.mapping.options import MapOptions
+from vcl_companion.mapping.patch_table import PatchTable, PyramidOf, Reference
+from vcl_companion.mapping.placing import Placed, place, references
+from vcl_companion.mapping.thinning import spread
+from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
+from vcl_companion.mapping.uncertainty import MapUncertainty, views_of
+from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust
+from vcl_companion.vision.features import Detector, Features
+from vcl_companion.vision.patches import AlignRules, Pyramid
+from vcl_companion.vision.resection import NotFound
+
+ImageFeatures = Callable[[bytes, Camera, Detector], Features]
+
+# Old keyframes that a new view is matched with, besides all other new views.
+_PARTNERS = 3
+_AGAIN = AlignRules(max_iterations=15, least_score=0.85, max_moved_px=1.5, settled_px=0.02)
+_RELATIVE_SIGMA = 0.02
+_STEPS = (8, 12)
+_CAUCHY_PX = 0.5
+# Residuals of patches that are the same spot: first loosely, by poses not adjusted yet.
+_LIMIT_PX = (1.5, 0.5)
+_MAX_SIGMAS = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """All landmarks in all views, while they are worked on.
+
+    Attributes:
+        observed: (N, V, 2) px.
+        points: (N, 3) m, NaN where not placed.
+        source: (N,) view that a new landmark's patch is cut from, -1 for old ones.
+        bodies: V poses.
+    """
+
+    observed: Array
+    points: Array
+    source: Index
+    bodies: tuple[Pose, ...]
+
+
+class Extension:
+    """One extension under way.
+
+    Args:
+        old: the map so far.
+        sure: its uncertainty.
+        views: new ones, with a guess of where they were taken.
+        features_of: finds features in an encoded image.
+        pyramid_of: decodes one.
+        options: thresholds.
+    """
+
+    def __init__(
+        self,
+        old: LandmarkMap,
+        sure: MapUncertainty,
+        views: list[DroneView],
+        features_of: ImageFeatures,
+        pyramid_of: PyramidOf,
+        options: MapOptions,
+    ) -> None:
+        self._old, self._sure, self._views, self._options = old, sure, views, options
+        self._features_of = features_of
+        self._n_keys = len(old.keyframes)
+        shown_by: list[Keyframe | DroneView] = [*old.keyframes, *views]
+        self._cameras = [v.camera for v in shown_by]
+        self._images = [(v.image_bytes, v.camera) for v in shown_by]
+        self._mountings = tuple(v.body_from_cam for v in shown_by)
+        self._table = PatchTable(self._cameras, [_read(pyramid_of, *i) for i in self._images])
+        self._relative = depth_errors(views_of(old))
+        self.reasons: dict[int, str] = {}
+
+    def run(self) -> Growth | None:
+        """Return the grown map; None where no view has its place on it."""
+        keys = [k.world_from_body @ k.body_from_cam for k in self._old.keyframes]
+        joined: dict[int, Placed] = {}
+        for i, view in enumerate(self._views):
+            if view.world_from_body is None:
+                continue
+            found = place(
+                view,
+                self._n_keys + i,
+                view.world_from_body,
+                self._old,
+                self._sure,
+                self._relative,
+                self._table,
+                keys,
+                self._options,
+            )
+            if isinstance(found, NotFound):
+                self.reasons[i] = found.reason
+            else:
+                joined[i] = found
+        if not joined:
+            return None
+        table = self._with_new(self._start(joined), sorted(joined))
+        table, good, _ = self._adjusted(table, 0)
+        table = self._measured_again(table, good, sorted(joined))
+        table, good, noise_px = self._adjusted(table, 1)
+        return self._growth(table, good, noise_px, sorted(joined))
+
+    def _start(self, joined: dict[int, Placed]) -> Table:
+        """Return the old landmarks in the old keyframes and in the views that joined."""
+        n, v = len(self._old.points_world), len(self._cameras)
+        observed = np.full((n, v, 2), np.nan)
+        observed[:, : self._n_keys] = self._old.observed_px
+        bodies = [k.world_from_body for k in self._old.keyframes]
+        for i, view in enumerate(self._views):
+            at = joined.get(i)
+            # A view that has not joined sees nothing; where it is does not matter.
+            bodies.append(at.world_from_body if at else view.world_from_body or Pose.identity())
+            if at:
+                observed[at.landmarks, self._n_keys + i] = at.pixels
+        return Table(observed, self._old.points_world, np.full(n, -1, np.intp), tuple(bodies))
+
+    def _with_new(self, table: Table, joined: list[int]) -> Table:
+        """Add landmarks that new views show and the map has not."""
+        cams = self._cams(table)
+        columns = [self._n_keys + i for i in joined]
+        partners = {c: self._partners(table, c, cams) for c in columns}
+        used = sorted({*columns, *(k for some in partners.values() for k in some)})
+        detector, per_cell = self._options.detectors[0], self._options.landmarks_per_cell
+        views: dict[int, Shown] = {}
+        for c in used:
+            try:
+                features = self._features_of(*self._images[c], detector)
+            except ValueError:
+                continue
+            free = shown(features, self._cameras[c])
+            views[c] = free_of(free, _seen_px(table.observed, c))
+        for c in columns:
+            others = [t for t in [*columns, *partners[c]] if t != c and t in views]
+            if c not in views or not others:
+                continue
+            shown_by = dict(views)
+            taken_px = _seen_px(table.observed, c)
+            shown_by[c] = with_room(views[c], taken_px, self._cameras[c], per_cell)
+            known = table.points[np.isfinite(table.observed[:, c, 0])]
+            known = known[np.isfinite(known[:, 0])]
+            observed, points = new_landmarks(
+                c, others, shown_by, self._cameras, cams, known, self._table
+            )
+            kept = spread(observed[:, [c]], [self._cameras[c]], per_cell)
+            observed, points = observed[kept], points[kept]
+            table = replace(
+                table,
+                observed=np.concatenate([table.observed, observed]),
+                points=np.concatenate([table.points, points]),
+                source=np.concatenate([table.source, np.full(len(points), c)]),
+            )
+            views = {t: free_of(view, _seen_px(observed, t)) for t, view in views.items()}
+        return table
+
+    def _partners(self, table: Table, column: int, cams: list[Pose]) -> list[int]:
+        """Return the old keyframes that share most with a view, under the widest angles."""
+        seen = np.isfinite(table.observed[:, column, 0])
+        shared = [
+            overlap(
+                self._old.points_world[seen & np.isfinite(self._old.observed_px[:, k, 0])],
+                cams[column],
+                cams[k],
+            )
+            for k in range(self._n_keys)
+        ]
+        return [int(k) for k in np.argsort(shared)[::-1][:_PARTNERS] if shared[k] > 0.0]
+
+    def _adjusted(self, table: Table, turn: int) -> tuple[Table, Mask, float]:
+        """Place, drop what misses, adjust what is left, drop again."""
+        ideal = ideal_of_pixels(table.observed, self._cameras)
+        views = Views(
+            bodies=table.bodies,
+            mountings=self._mountings,
+            slopes=slopes_of_ideal(ideal, self._cameras),
+            ideal=ideal,
+            points=table.points,
+            distances=tuple(
+                Distance(d.keyframe_a, d.keyframe_b, d.distance_m, d.sigma_m)
+                for d in self._old.distances
+            ),
+        )
+        if turn == 0:
+            fresh = table.source >= 0
+            points = table.points.copy()
+            points[fresh] = placed(self._cams(table), ideal[fresh])
+            views = replace(views, points=points)
+        limit_px = max(_LIMIT_PX[turn], _MAX_SIGMAS * self._old.pixel_noise_px)
+        fits, good = fitting(views, 2.0 * limit_px, self._options)
+        views = replace(views, ideal=np.where(fits[..., None], ideal, np.nan))
+        adjusted, noise_px = adjust(
+            _of(views, good), BundleOptions(_STEPS[turn], _CAUCHY_PX, least_gain=1e-5)
+        )
+        points = views.points.copy()
+        points[good] = adjusted.points
+        views = replace(views, bodies=adjusted.bodies, points=points)
+        fits, again = fitting(views, max(_LIMIT_PX[turn], _MAX_SIGMAS * noise_px), self._options)
+        observed = np.where(fits[..., None], table.observed, np.nan)
+        return (
+            replace(table, observed=observed, points=points, bodies=adjusted.bodies),
+            good & again,
+            noise_px,
+        )
+
+    def _measured_again(self, table: Table, good: Mask, joined: list[int]) -> Table:
+        """Look for patches again from adjusted poses: old ones in new views, new ones in all."""
+        cams = self._cams(table)
+        observed = table.observed.copy()
+        old = np.flatnonzero(good & (table.source < 0))
+        known = replace(
+            self._old,
+            keyframes=tuple(
+                replace(k, world_from_body=body)
+                for k, body in zip(self._old.keyframes, table.bodies, strict=False)
+            ),
+            points_world=table.points[old],
+            observed_px=table.observed[old, : self._n_keys],
+        )
+        for i in joined:
+            c = self._n_keys + i
+            which, reference = references(
+                known, self._cameras[c], cams[c], self._relative[old], len(old)
+            )
+            found = self._table.found(reference, cams, [c], _AGAIN)[:, c]
+            observed[old, c] = np.nan
+            observed[old[which], c] = found
+        fresh = np.flatnonzero(good & (table.source >= 0))
+        view = table.source[fresh]
+        kept = np.isfinite(table.observed[fresh, view, 0])
+        fresh, view = fresh[kept], view[kept]
+        if len(fresh):
+            reference = Reference(
+                view,
+                table.observed[fresh, view],
+                table.points[fresh],
+                np.full(len(fresh), _RELATIVE_SIGMA),
+            )
+            columns = [*range(self._n_keys), *(self._n_keys + i for i in joined)]
+            observed[fresh] = self._table.found(reference, cams, columns, _AGAIN)
+        return replace(table, observed=observed)
+
+    def _growth(self, table: Table, good: Mask, noise_px: float, joined: list[int]) -> Growth:
+        columns = [*range(self._n_keys), *(self._n_keys + i for i in joined)]
+        keyframes = tuple(
+            replace(k, world_from_body=body)
+            for k, body in zip(self._old.keyframes, table.bodies, strict=False)
+        ) + tuple(keyframe_of(self._views[i], table.bodies[self._n_keys + i]) for i in joined)
+        n_old = len(self._old.points_world)
+        number = np.arange(len(good))
+        return Growth(
+            replace(
+                self._old,
+                keyframes=keyframes,
+                points_world=table.points[good],
+                observed_px=table.observed[good][:, columns],
+                pixel_noise_px=noise_px,
+                detectors=tuple(dict.fromkeys(self._old.detectors + self._options.detectors)),
+            ),
+            tuple(joined),
+            np.where(number < n_old, number, -1)[good],
+            {},
+        )
+
+    def _cams(self, table: Table) -> list[Pose]:
+        return [b @ m for b, m in zip(table.bodies, self._mountings, strict=True)]
+
+
+def _read(pyramid_of: PyramidOf, image_bytes: bytes, camera: Camera) -> Pyramid | None:
+    try:
+        return pyramid_of(image_bytes, camera)
+    except ValueError:
+        return None
+
+
+def _seen_px(observed: Array, column: int) -> Array:
+    pixels = observed[:, column]
+    return np.asarray(pixels[np.isfinite(pixels[:, 0])])
+
+
+def _of(views: Views, good: Mask) -> Views:
+    return replace(
+        views, slopes=views.slopes[good], ideal=views.ideal[good], points=views.points[good]
+    )

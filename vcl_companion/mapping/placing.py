@@ -1,0 +1,147 @@
+"""A new view placed on a map by the patches of its landmarks, near where it is guessed to be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.mapping.drone_view import DroneView
+from vcl_companion.mapping.joining import believed
+from vcl_companion.mapping.known_features import Index
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.options import MapOptions
+from vcl_companion.mapping.patch_table import PatchTable, Reference
+from vcl_companion.mapping.tracks import PairMatches
+from vcl_companion.mapping.uncertainty import MapUncertainty
+from vcl_companion.vision.patches import AlignRules
+from vcl_companion.vision.resection import NotFound, ResectionOptions, Sightings, refine
+
+_MIN_INLIERS = 20
+# So many landmarks fix a pose; all of them are looked for once that is known.
+_WANTED = 500
+_NOISE_PX = 0.15
+_WIDE = AlignRules(max_iterations=15, least_score=0.75, max_moved_px=3.0)
+_CLOSE = AlignRules(max_iterations=15, least_score=0.8, max_moved_px=1.5, settled_px=0.02)
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A view on a map.
+
+    Attributes:
+        world_from_body: where it was taken.
+        landmarks: (M,) of the map, that it shows.
+        pixels: (M, 2) where, raw px.
+    """
+
+    world_from_body: Pose
+    landmarks: Index
+    pixels: Array
+
+
+def references(
+    known: LandmarkMap, camera: Camera, world_from_cam: Pose, relative_sigma: Array, n_wanted: int
+) -> tuple[Index, Reference]:
+    """Return which landmarks a view may show, each in the keyframe that saw it most alike.
+
+    Args:
+        known: the map.
+        camera: of the view.
+        world_from_cam: where it was taken.
+        relative_sigma: (N,) of the landmarks' distances.
+        n_wanted: at most so many, evenly of all there are.
+    """
+    pixels = camera.project(world_from_cam.inverse().apply(known.points_world))
+    size = np.array([camera.width_px, camera.height_px])
+    with np.errstate(invalid="ignore"):
+        inside = np.flatnonzero(((pixels > 6.0) & (pixels < size - 7.0)).all(axis=1))
+    points = known.points_world[inside]
+    ray = points - world_from_cam.translation
+    distance = np.maximum(np.linalg.norm(ray, axis=1), 1e-9)
+    best, unlike = np.full(len(inside), -1, dtype=np.intp), np.full(len(inside), np.inf)
+    for k, keyframe in enumerate(known.keyframes):
+        origin = (keyframe.world_from_body @ keyframe.body_from_cam).translation
+        then = points - origin
+        length = np.maximum(np.linalg.norm(then, axis=1), 1e-9)
+        cosine = np.einsum("ni,ni->n", ray, then) / (distance * length)
+        octaves = np.log2(length / distance * camera.focal_px / keyframe.camera.focal_px)
+        # Seen twice as large costs as much as seen from 30 degrees aside; shrunk, half of that.
+        score = np.arccos(np.clip(cosine, -1.0, 1.0)) + 0.5 * np.maximum(octaves, -0.5 * octaves)
+        score = np.where(np.isfinite(known.observed_px[inside, k, 0]), score, np.inf)
+        best, unlike = np.where(score < unlike, k, best), np.minimum(score, unlike)
+    chosen = np.flatnonzero(best >= 0)
+    if len(chosen) > n_wanted:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, n_wanted).astype(np.intp)]
+    landmarks, view = inside[chosen], best[chosen]
+    return landmarks, Reference(
+        view, known.observed_px[landmarks, view], points[chosen], relative_sigma[landmarks]
+    )
+
+
+def place(
+    view: DroneView,
+    column: int,
+    guess: Pose,
+    known: LandmarkMap,
+    sure: MapUncertainty,
+    relative_sigma: Array,
+    table: PatchTable,
+    worlds_from_cams: list[Pose],
+    options: MapOptions,
+) -> Placed | NotFound:
+    """Find a view's pose and the landmarks that it shows.
+
+    Args:
+        view: the view.
+        column: of the view in the table; the map's keyframes come first.
+        guess: where it was taken, to some pixels.
+        known: the map.
+        sure: how well it is known.
+        relative_sigma: (N,) of the landmarks' distances.
+        table: the images.
+        worlds_from_cams: where those before the column were taken.
+        options: how vague a pose may be.
+    """
+    pose = guess
+    poses = [*worlds_from_cams, *[guess] * (table.n_views - len(worlds_from_cams))]
+    landmarks, reference = references(
+        known, view.camera, guess @ view.body_from_cam, relative_sigma, _WANTED
+    )
+    result: Placed | NotFound = NotFound("no landmark of the map is in view")
+    for rules in (_WIDE, _CLOSE):
+        if len(landmarks) == 0:
+            return result
+        poses[column] = pose @ view.body_from_cam
+        found = table.found(reference, poses, [column], rules)[:, column]
+        hit = np.flatnonzero(np.isfinite(found[:, 0]))
+        links = PairMatches(landmarks[hit], np.arange(len(hit), dtype=np.intp))
+        sightings = _sightings(view, links.a, found[hit], known, sure)
+        refined = refine(pose, sightings, ResectionOptions(min_inliers=_MIN_INLIERS))
+        checked = believed(view, links, refined, known, sure, options)
+        if isinstance(checked, NotFound):
+            return checked
+        pose = checked.world_from_body
+        result = Placed(pose, checked.links.a, found[hit][checked.links.b])
+    return result
+
+
+def _sightings(
+    view: DroneView, landmarks: Index, pixels: Array, known: LandmarkMap, sure: MapUncertainty
+) -> Sightings:
+    ideal = view.camera.ideal_from_pixels(pixels)
+    lever = sure.landmark_lever[landmarks]
+    shared = lever @ sure.keyframe_covariance
+    return Sightings(
+        ideal,
+        known.points_world[landmarks],
+        sure.landmark_covariance[landmarks] + shared @ np.swapaxes(lever, 1, 2),
+        view.camera.focal_px,
+        view.camera.pixel_slopes(ideal),
+        view.body_from_cam,
+        max(known.pixel_noise_px, _NOISE_PX),
+        np.zeros(len(landmarks)),
+    )

@@ -1,0 +1,106 @@
+"""A map's observations measured again by patches, and adjusted again (issue 4; IV-C, IV-F)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vcl_companion.mapping.culling import depth_errors, fitting
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.options import MapOptions
+from vcl_companion.mapping.patch_table import PatchTable, PyramidOf, Reference, decoded_pyramid
+from vcl_companion.mapping.uncertainty import views_of
+from vcl_companion.vision.bundle import BundleOptions, adjust
+from vcl_companion.vision.patches import AlignRules, Pyramid
+
+# A first alignment starts from poses that are some pixels off, the next ones do not.
+_ROUNDS = (
+    AlignRules(max_iterations=15, least_score=0.8, max_moved_px=3.0, settled_px=0.02),
+    AlignRules(max_iterations=15, least_score=0.85, max_moved_px=1.5, settled_px=0.02),
+)
+# Residuals of patches that are the same spot.
+_MAX_SIGMAS, _LEAST_LIMIT_PX = 4.0, 0.5
+_CAUCHY_PX = 0.5
+
+
+def sharpened(
+    landmark_map: LandmarkMap,
+    options: MapOptions,
+    pyramid_of: PyramidOf = decoded_pyramid,
+) -> LandmarkMap:
+    """Return a map whose observations are patches aligned to each other.
+
+    Each landmark is cut out of that keyframe from which most others find it.
+    Landmarks that no other keyframe finds are left out.
+
+    Args:
+        landmark_map: of a few keyframes.
+        options: largest depth error, smallest angle.
+        pyramid_of: the image of a keyframe.
+    """
+    cameras = [k.camera for k in landmark_map.keyframes]
+    table = PatchTable(cameras, pyramids_of(landmark_map, pyramid_of))
+    for rules in _ROUNDS:
+        landmark_map = _round(landmark_map, table, rules, options)
+        if len(landmark_map.points_world) < options.min_landmarks:
+            break
+    return landmark_map
+
+
+def pyramids_of(landmark_map: LandmarkMap, pyramid_of: PyramidOf) -> list[Pyramid | None]:
+    """Return the images of a map's keyframes; None where the bytes are none."""
+    out: list[Pyramid | None] = []
+    for k in landmark_map.keyframes:
+        try:
+            out.append(pyramid_of(k.image_bytes, k.camera))
+        except ValueError:
+            out.append(None)
+    return out
+
+
+def _round(
+    landmark_map: LandmarkMap, table: PatchTable, rules: AlignRules, options: MapOptions
+) -> LandmarkMap:
+    landmark, view = np.nonzero(landmark_map.seen)
+    order = np.argsort(landmark, kind="stable")
+    landmark, view = landmark[order], view[order]
+    reference = Reference(
+        view,
+        landmark_map.observed_px[landmark, view],
+        landmark_map.points_world[landmark],
+        depth_errors(views_of(landmark_map))[landmark],
+    )
+    cams = [k.world_from_body @ k.body_from_cam for k in landmark_map.keyframes]
+    found = table.found(reference, cams, list(range(len(cams))), rules)
+    count = np.isfinite(found[:, :, 0]).sum(axis=1)
+    # The last one written wins: of each landmark the patch that most keyframes find.
+    best = np.full(len(landmark_map.points_world), -1, dtype=np.intp)
+    rising = np.argsort(count, kind="stable")
+    best[landmark[rising]] = rising
+    kept = np.flatnonzero(best >= 0)
+    kept = kept[count[best[kept]] >= 2]
+    measured = replace(
+        landmark_map,
+        points_world=landmark_map.points_world[kept],
+        observed_px=found[best[kept]],
+    )
+    return measured if len(kept) < options.min_landmarks else adjusted_map(measured, options)
+
+
+def adjusted_map(landmark_map: LandmarkMap, options: MapOptions) -> LandmarkMap:
+    """Adjust a map of patches; leave out what misses by more than patches do."""
+    views, noise_px = adjust(views_of(landmark_map), BundleOptions(cauchy_px=_CAUCHY_PX))
+    limit_px = max(_MAX_SIGMAS * noise_px, _LEAST_LIMIT_PX)
+    fits, good = fitting(views, limit_px, options)
+    observed = np.where(fits[..., None], landmark_map.observed_px, np.nan)[good]
+    return replace(
+        landmark_map,
+        keyframes=tuple(
+            replace(k, world_from_body=body)
+            for k, body in zip(landmark_map.keyframes, views.bodies, strict=True)
+        ),
+        points_world=views.points[good],
+        observed_px=observed,
+        pixel_noise_px=noise_px,
+    )

@@ -1,0 +1,224 @@
+"""Bundle adjustment, compiled: landmarks are eliminated as they are linearised.
+
+Observations stand landmark by landmark, so that a landmark's blocks are built,
+inverted and eliminated in one pass; nothing of size (landmarks x views) is made.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.vision.compiled import compiled
+
+Ints = NDArray[np.int64]
+
+_MIN_DEPTH_M = 1e-3
+_BEHIND_PX = 1e3
+
+
+@compiled
+def _linearized(
+    point: Array,
+    body: Array,
+    mounting: Array,
+    slopes: Array,
+    ideal: Array,
+    residual: Array,
+    j_pose: Array,
+    j_point: Array,
+) -> None:
+    """Residual (2,) of one observation, its slopes (2, 6) by the body and (2, 3) by the point.
+
+    ``body`` is world_from_body, ``mounting`` body_from_cam, each (3, 4).
+    """
+    p = np.empty(3)
+    c = np.empty(3)
+    for r in range(3):
+        p[r] = (
+            body[0, r] * (point[0] - body[0, 3])
+            + body[1, r] * (point[1] - body[1, 3])
+            + body[2, r] * (point[2] - body[2, 3])
+        )
+    for r in range(3):
+        c[r] = (
+            mounting[0, r] * (p[0] - mounting[0, 3])
+            + mounting[1, r] * (p[1] - mounting[1, 3])
+            + mounting[2, r] * (p[2] - mounting[2, 3])
+        )
+    if not c[2] > _MIN_DEPTH_M:
+        residual[:] = _BEHIND_PX
+        j_pose[:] = 0.0
+        j_point[:] = 0.0
+        return
+    u, v = c[0] / c[2], c[1] / c[2]
+    for k in range(2):
+        residual[k] = slopes[k, 0] * (u - ideal[0]) + slopes[k, 1] * (v - ideal[1])
+        a = slopes[k, 0] / c[2]
+        b = slopes[k, 1] / c[2]
+        d = -(slopes[k, 0] * u + slopes[k, 1] * v) / c[2]
+        # By the point in body axes.
+        x = a * mounting[0, 0] + b * mounting[0, 1] + d * mounting[0, 2]
+        y = a * mounting[1, 0] + b * mounting[1, 1] + d * mounting[1, 2]
+        z = a * mounting[2, 0] + b * mounting[2, 1] + d * mounting[2, 2]
+        j_pose[k, 0], j_pose[k, 1], j_pose[k, 2] = -x, -y, -z
+        j_pose[k, 3] = y * p[2] - z * p[1]
+        j_pose[k, 4] = z * p[0] - x * p[2]
+        j_pose[k, 5] = x * p[1] - y * p[0]
+        for r in range(3):
+            j_point[k, r] = x * body[r, 0] + y * body[r, 1] + z * body[r, 2]
+
+
+@compiled
+def cost_of(
+    points: Array,
+    bodies: Array,
+    mountings: Array,
+    first: Ints,
+    view: Ints,
+    slopes: Array,
+    ideal: Array,
+    cauchy_px: float,
+) -> float:
+    """Return the robust cost, px^2."""
+    residual, j_pose, j_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
+    cost = 0.0
+    for j in range(len(first) - 1):
+        for m in range(first[j], first[j + 1]):
+            i = view[m]
+            _linearized(
+                points[j], bodies[i], mountings[i], slopes[m], ideal[m], residual, j_pose, j_point
+            )
+            squared = residual[0] ** 2 + residual[1] ** 2
+            cost += cauchy_px**2 * np.log1p(squared / cauchy_px**2)
+    return cost
+
+
+@compiled
+def reduced(
+    points: Array,
+    bodies: Array,
+    mountings: Array,
+    first: Ints,
+    view: Ints,
+    slopes: Array,
+    ideal: Array,
+    cauchy_px: float,
+    damping: float,
+) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Linearise every observation and eliminate the landmarks.
+
+    Args:
+        points: (N, 3).
+        bodies: (V, 3, 4) world_from_body.
+        mountings: (V, 3, 4) body_from_cam.
+        first: (N + 1,) where each landmark's observations begin.
+        view: (M,) of each observation.
+        slopes: (M, 2, 2) d(pixel) / d(ideal).
+        ideal: (M, 2).
+        cauchy_px: robust scale.
+        damping: of the landmarks' own blocks, relative.
+
+    Returns:
+        (6V, 6V) reduced normal matrix, (6V,) its right side, (6V,) the poses' own
+        diagonal, (N, 3, 3) inverses of the landmarks' blocks, (N, 3) their right
+        sides, (M, 6, 3) couplings.
+    """
+    size = 6 * len(bodies)
+    normal, rhs, diagonal = np.zeros((size, size)), np.zeros(size), np.zeros(size)
+    inverses, pulls = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+    crosses = np.zeros((len(view), 6, 3))
+    residual, j_pose, j_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
+    block, left = np.empty((3, 3)), np.empty((6, 3))
+    for j in range(len(points)):
+        block[:] = 0.0
+        for m in range(first[j], first[j + 1]):
+            i = view[m]
+            _linearized(
+                points[j], bodies[i], mountings[i], slopes[m], ideal[m], residual, j_pose, j_point
+            )
+            squared = residual[0] ** 2 + residual[1] ** 2
+            weight = 1.0 / (1.0 + squared / cauchy_px**2)
+            a = 6 * i
+            for r in range(6):
+                wr0, wr1 = weight * j_pose[0, r], weight * j_pose[1, r]
+                rhs[a + r] -= wr0 * residual[0] + wr1 * residual[1]
+                for c in range(6):
+                    normal[a + r, a + c] += wr0 * j_pose[0, c] + wr1 * j_pose[1, c]
+                for c in range(3):
+                    crosses[m, r, c] = wr0 * j_point[0, c] + wr1 * j_point[1, c]
+                diagonal[a + r] += wr0 * j_pose[0, r] + wr1 * j_pose[1, r]
+            for r in range(3):
+                wr0, wr1 = weight * j_point[0, r], weight * j_point[1, r]
+                pulls[j, r] -= wr0 * residual[0] + wr1 * residual[1]
+                for c in range(3):
+                    block[r, c] += wr0 * j_point[0, c] + wr1 * j_point[1, c]
+        for r in range(3):
+            block[r, r] = block[r, r] * (1.0 + damping) + 1e-9
+        inverse = inverses[j]
+        _invert(block, inverse)
+        for m in range(first[j], first[j + 1]):
+            a = 6 * view[m]
+            for r in range(6):
+                for c in range(3):
+                    left[r, c] = (
+                        crosses[m, r, 0] * inverse[0, c]
+                        + crosses[m, r, 1] * inverse[1, c]
+                        + crosses[m, r, 2] * inverse[2, c]
+                    )
+                rhs[a + r] -= (
+                    left[r, 0] * pulls[j, 0] + left[r, 1] * pulls[j, 1] + left[r, 2] * pulls[j, 2]
+                )
+            for n in range(first[j], m + 1):
+                b = 6 * view[n]
+                for r in range(6):
+                    for c in range(6):
+                        normal[a + r, b + c] -= (
+                            left[r, 0] * crosses[n, c, 0]
+                            + left[r, 1] * crosses[n, c, 1]
+                            + left[r, 2] * crosses[n, c, 2]
+                        )
+    # Observations of a landmark stand by rising view: only blocks below the diagonal were written.
+    for a in range(size):
+        for b in range(a):
+            normal[b, a] = normal[a, b]
+    return normal, rhs, diagonal, inverses, pulls, crosses
+
+
+@compiled
+def _invert(block: Array, inverse: Array) -> None:
+    """Invert a symmetric (3, 3) block by its cofactors."""
+    a, b, c = block[0, 0], block[0, 1], block[0, 2]
+    d, e, f = block[1, 1], block[1, 2], block[2, 2]
+    first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
+    factor = 1.0 / (a * first + b * second + c * third)
+    inverse[0, 0] = first * factor
+    inverse[0, 1] = inverse[1, 0] = second * factor
+    inverse[0, 2] = inverse[2, 0] = third * factor
+    inverse[1, 1] = (a * f - c * c) * factor
+    inverse[1, 2] = inverse[2, 1] = (b * c - a * e) * factor
+    inverse[2, 2] = (a * d - b * b) * factor
+
+
+@compiled
+def substituted(
+    pose_step: Array, first: Ints, view: Ints, inverses: Array, pulls: Array, crosses: Array
+) -> Array:
+    """Return the (N, 3) step of the landmarks that goes with a (6V,) step of the poses."""
+    out = np.empty(pulls.shape)
+    right = np.empty(3)
+    for j in range(len(pulls)):
+        right[:] = pulls[j]
+        for m in range(first[j], first[j + 1]):
+            a = 6 * view[m]
+            for r in range(6):
+                for c in range(3):
+                    right[c] -= crosses[m, r, c] * pose_step[a + r]
+        for r in range(3):
+            out[j, r] = (
+                inverses[j, r, 0] * right[0]
+                + inverses[j, r, 1] * right[1]
+                + inverses[j, r, 2] * right[2]
+            )
+    return out
