@@ -283,7 +283,11 @@ class _Matcher:
     def whole_map(self) -> _Matched:
         """Match against every landmark, then search the pose among the matches."""
         found, landmarks = match_to_entries(
-            self.features, self.index.entries, self.index.owner, MatchOptions()
+            self.features,
+            self.index.entries,
+            self.index.owner,
+            MatchOptions(),
+            self.index.search,
         )
         sightings = self._sightings(found, landmarks, None)
         start = search(sightings, self._resection_options(_FOUND_LEVERAGE))

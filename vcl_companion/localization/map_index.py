@@ -14,6 +14,7 @@ from vcl_companion.mapping.drone_view import decode_image
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
 from vcl_companion.vision.features import Detector, FeatureOptions, Features, detect
+from vcl_companion.vision.hamming import HammingIndex, hamming_index
 
 # Patches say better than the detector where its features are.
 _SAME_PX = 1.0
@@ -30,6 +31,7 @@ class MapIndex:
         entries: M descriptors, one for each keyframe that a landmark was recognised in.
         owner: (M,) landmark of each entry.
         detector: what made the descriptors.
+        search: the descriptors as they are searched; None when they are not binary.
     """
 
     landmark_map: LandmarkMap
@@ -38,6 +40,7 @@ class MapIndex:
     entries: Features
     owner: NDArray[np.intp]
     detector: Detector
+    search: HammingIndex | None = None
 
 
 def index_map(
@@ -76,11 +79,11 @@ def index_map(
     if not owners or sum(map(len, owners)) == 0:
         raise ValueError(f"the map has no landmark that {detector} finds again in its keyframes")
     uncertainty = map_uncertainty(landmark_map)
+    entries = Features(np.concatenate(pixels), np.concatenate(descriptors))
+    owner = np.concatenate(owners).astype(np.intp)
+    search = None
+    if entries.descriptors.dtype == np.uint8:
+        search = hamming_index(np.asarray(entries.descriptors, dtype=np.uint8), owner)
     return MapIndex(
-        landmark_map,
-        uncertainty,
-        uncertainty.marginal(),
-        Features(np.concatenate(pixels), np.concatenate(descriptors)),
-        np.concatenate(owners).astype(np.intp),
-        detector,
+        landmark_map, uncertainty, uncertainty.marginal(), entries, owner, detector, search
     )

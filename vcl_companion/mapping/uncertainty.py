@@ -89,7 +89,8 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
         scaled = replace(views, slopes=views.slopes / noise_px)
         system = normal_equations(scaled, None)
         inverse = _inverse(system.point_block)
-        lever = -np.swapaxes(system.cross @ inverse, 1, 2)
+        # In the order in which compiled loops were compiled for it.
+        lever = np.ascontiguousarray(-np.swapaxes(system.cross @ inverse, 1, 2))
         reduced = system.pose_block - eliminated(system.cross, inverse, system.seen)
         covariance = np.zeros_like(reduced)
         covariance[6:, 6:] = _inverse(reduced[6:, 6:])

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.vision.features import Features
+from vcl_companion.vision.hamming import FAR, HammingIndex, hamming_index, nearest_two
 
 Index = NDArray[np.intp]
 
@@ -52,7 +53,11 @@ def match_mutual(a: Features, b: Features, options: MatchOptions) -> tuple[Index
 
 
 def match_to_entries(
-    features: Features, entries: Features, owner: Index, options: MatchOptions
+    features: Features,
+    entries: Features,
+    owner: Index,
+    options: MatchOptions,
+    index: HammingIndex | None = None,
 ) -> tuple[Index, Index]:
     """Match an image against a map whose landmarks have one or more descriptors each.
 
@@ -61,6 +66,7 @@ def match_to_entries(
         entries: M descriptors of the map.
         owner: (M,) landmark that each entry belongs to.
         options: the ratio is taken against the best entry of *another* landmark.
+        index: the same entries, laid out once, when they are binary; None: laid out here.
 
     Returns:
         (K,) features and (K,) landmarks, one to one: of several features that
@@ -68,6 +74,15 @@ def match_to_entries(
     """
     if len(features) == 0 or len(entries) == 0:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    if features.descriptors.dtype == np.uint8:
+        searched = index or hamming_index(_binary(entries), owner, divided=False)
+        landmark, nearest, other = nearest_two(_binary(features), searched)
+        limit = options.ratio * np.where(other == FAR, _worst(features), other)
+        return _one_to_one(
+            np.flatnonzero((landmark >= 0) & (nearest < limit)),
+            landmark.astype(np.intp),
+            nearest.astype(np.float64),
+        )
     # As many neighbours as it takes to be sure of another landmark among them.
     n_own = int(np.unique(owner, return_counts=True)[1].max())
     best, distance = _knn(cv2.BFMatcher(_norm(features)), features, entries, n_own + 1)
@@ -141,6 +156,10 @@ def match_guided(
     chosen = start[ok]
     pick, _ = _one_to_one(np.arange(len(chosen)), candidate[chosen], distance[chosen])
     return candidate[chosen][pick], landmark[chosen][pick]
+
+
+def _binary(features: Features) -> NDArray[np.uint8]:
+    return np.asarray(features.descriptors, dtype=np.uint8)
 
 
 def _worst(features: Features) -> float:

@@ -19,6 +19,7 @@ from vcl_companion.vision.acransac import AcRansacOptions
 from vcl_companion.vision.acransac import NotFound as NotFound
 from vcl_companion.vision.bundle import linearized
 from vcl_companion.vision.information import covariance_of
+from vcl_companion.vision.pose_kernels import DIVERGED, SINGULAR, converged
 
 Mask = NDArray[np.bool_]
 
@@ -28,6 +29,7 @@ _CHI2_2_99 = 9.21
 # noise in two dimensions: E[w^2 s/2] E[w]^2 / (E[w + s w']^2 E[w^2]) with w = (1 + s/4)^-2.
 _ROBUST_LOSS = 1.1136
 _MAX_ROUNDS = 3
+_SCALES = np.array([8.0, 3.0, 1.0, 1.0])
 # Smallest eigenvalue of a normal matrix, scaled to a diagonal of ones, that is no rounding.
 _SINGULAR = 1e-9
 
@@ -165,24 +167,23 @@ def refine(
 
 def _converged(pose: Pose, sightings: Sightings) -> Pose | NotFound:
     """Gauss-Newton with a redescending weight, wide at first."""
-    for scale in (8.0, 3.0, 1.0, 1.0):
-        for _ in range(4):
-            residual, j_pose, j_point = _linearized(pose, sightings)
-            information = _information(j_point, sightings, scale)
-            weighted = _weighted(residual, j_pose, information)
-            normal = np.einsum("nik,nkj->ij", weighted, j_pose)
-            rhs = -np.einsum("nik,nk->i", weighted, residual)
-            try:
-                step = np.linalg.solve(normal, rhs)
-            except np.linalg.LinAlgError:
-                return NotFound("the matched landmarks do not fix a pose")
-            length = float(np.linalg.norm(step))
-            if not np.isfinite(length) or length > 1e3:
-                return NotFound("the refinement of the pose diverged")
-            pose = pose.retracted(step)
-            if length < (1e-4 if scale > 1.0 else 1e-7):
-                break
-    return pose
+    pixel = sightings.noise_px**2 + sightings.bias_px**2
+    matrix, outcome = converged(
+        np.ascontiguousarray(pose.matrix()[:3]),
+        np.ascontiguousarray(sightings.body_from_cam.matrix()[:3]),
+        np.array(sightings.ideal),
+        np.array(sightings.slopes),
+        np.array(sightings.points),
+        np.ascontiguousarray(sightings.point_covariances[:, *np.triu_indices(3)]),
+        np.column_stack([pixel, np.zeros_like(pixel), pixel]),
+        np.zeros((6, 6)),
+        _SCALES,
+    )
+    if outcome == SINGULAR:
+        return NotFound("the matched landmarks do not fix a pose")
+    if outcome == DIVERGED:
+        return NotFound("the refinement of the pose diverged")
+    return Pose(matrix[:, :3], matrix[:, 3])
 
 
 def _supported(
