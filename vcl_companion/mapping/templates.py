@@ -32,6 +32,7 @@ from vcl_companion.vision.patches import (
     lens_of,
     pyramid_of,
 )
+from vcl_companion.vision.surface_kernels import inclinations
 
 _HALF_PX = 4
 _N_NEIGHBOURS = 12
@@ -170,43 +171,23 @@ def _only(anchors: Anchors, sigma: Array, kept: NDArray[np.bool_]) -> tuple[Anch
 
 
 def _inclined(anchors: Anchors, sigma: Array) -> Anchors:
-    """Return the anchors with the plane that their neighbours in the same keyframe lie on.
-
-    On a plane inverse depth is linear in the ideal image coordinates. Where few
-    neighbours are near, or they disagree, the surface faces the keyframe.
-    """
+    """Return the anchors with the plane that their neighbours in the same keyframe lie on."""
     planes = anchors.planes.copy()
     for i in range(len(anchors.images.worlds_from_cams)):
         rows = np.flatnonzero(anchors.keyframe == i)
         if len(rows) == 0:
             continue
-        x, y, r = planes[rows, 0], planes[rows, 1], planes[rows, 2]
-        length2 = 1.0 + x * x + y * y
-        facing = np.column_stack([x, y]) * (r / length2)[:, None]
         near = min(_N_NEIGHBOURS, len(rows))
-        distance, other = (
-            np.asarray(of_each).reshape(len(rows), near)
-            for of_each in cKDTree(anchors.pixels[rows]).query(anchors.pixels[rows], near)
+        distance, other = cKDTree(anchors.pixels[rows]).query(anchors.pixels[rows], near)
+        planes[rows, 3:5] = inclinations(
+            np.ascontiguousarray(planes[rows, :2]),
+            np.ascontiguousarray(planes[rows, 2]),
+            sigma[rows],
+            np.asarray(other, dtype=np.int64).reshape(len(rows), near),
+            np.asarray(distance, dtype=np.float64).reshape(len(rows), near),
+            _NEIGHBOURHOOD_PX,
+            _INCLINATION,
         )
-        dx, dy = x[other] - x[:, None], y[other] - y[:, None]
-        dr = r[other] - r[:, None]
-        variance = sigma[rows][other] ** 2 + sigma[rows][:, None] ** 2
-        close = np.exp(-0.5 * (distance / (0.5 * _NEIGHBOURHOOD_PX)) ** 2)
-        close[distance > _NEIGHBOURHOOD_PX] = 0.0
-        design = np.stack([np.ones_like(dx), dx, dy], axis=2)
-        solution = np.column_stack([np.zeros(len(rows)), facing])
-        # So steep a surface that depth grows as fast as the point moves aside.
-        stiffness = np.zeros((len(rows), 3, 3))
-        stiffness[:, [1, 2], [1, 2]] = 1.0 / (_INCLINATION * r[:, None]) ** 2
-        pull = np.einsum("nij,nj->ni", stiffness, solution)
-        for _ in range(6):
-            error = dr - np.einsum("nki,ni->nk", design, solution)
-            weight = close / variance / (1.0 + error**2 / (4.0 * variance)) ** 2
-            normal = np.einsum("nki,nk,nkj->nij", design, weight, design) + stiffness
-            normal[:, 0, 0] += 1e-9 / sigma[rows] ** 2
-            right = np.einsum("nki,nk,nk->ni", design, weight, dr) + pull
-            solution = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
-        planes[rows, 3:5] = solution[:, 1:]
     return replace(anchors, planes=planes)
 
 
