@@ -100,6 +100,8 @@ class PatchTable:
         worlds_from_cams: list[Pose],
         targets: list[int],
         rules: AlignRules,
+        reach_px: float = 0.0,
+        level: int = 0,
     ) -> Array:
         """Return (M, V, 2) where patches are found, the reference included; NaN elsewhere.
 
@@ -108,6 +110,8 @@ class PatchTable:
             worlds_from_cams: where the V views were taken.
             targets: views to look in.
             rules: when an alignment is believed.
+            reach_px: how far around the prediction patches are searched first.
+            level: of the pyramid that is searched; what is found is no finer than it.
         """
         out = np.full((len(reference.view), len(self._cameras), 2), np.nan)
         out[np.arange(len(reference.view)), reference.view] = reference.pixels
@@ -121,9 +125,9 @@ class PatchTable:
             if len(rows) == 0:
                 continue
             cam_from_world = worlds_from_cams[i].inverse()
-            radii = np.zeros(len(rows))
+            radii = np.full(len(rows), reach_px)
             aligned = align_patches(
-                anchors, rows, frame, self._lenses[i], cam_from_world, radii, 0, rules
+                anchors, rows, frame, self._lenses[i], cam_from_world, radii, level, rules
             )
             out[rows[aligned.found], i] = aligned.pixels[aligned.found]
         return out

@@ -23,9 +23,24 @@ from vcl_companion.vision.resection import NotFound, ResectionOptions, Sightings
 _MIN_INLIERS = 20
 # So many landmarks fix a pose; all of them are looked for once that is known.
 _WANTED = 500
-_NOISE_PX = 0.15
-_WIDE = AlignRules(max_iterations=15, least_score=0.75, max_moved_px=3.0)
-_CLOSE = AlignRules(max_iterations=15, least_score=0.8, max_moved_px=1.5, settled_px=0.02)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """One look at a view: how patches are searched, and how exactly they are found."""
+
+    rules: AlignRules
+    noise_px: float = 0.15
+    reach_px: float = 0.0
+    level: int = 0
+
+
+_NEAR = (
+    _Look(AlignRules(max_iterations=15, least_score=0.75, max_moved_px=3.0)),
+    _Look(AlignRules(max_iterations=15, least_score=0.8, max_moved_px=1.5, settled_px=0.02)),
+)
+# A guess by features may be so far off; what is found at a quarter of the resolution leads on.
+_FAR = (_Look(AlignRules(max_iterations=15, least_score=0.7), 1.0, 24.0, 2), *_NEAR)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,31 +121,55 @@ def place(
         worlds_from_cams: where those before the column were taken.
         options: how vague a pose may be.
     """
-    pose = guess
-    poses = [*worlds_from_cams, *[guess] * (table.n_views - len(worlds_from_cams))]
+    n_known = len(worlds_from_cams)
     landmarks, reference = references(
         known, view.camera, guess @ view.body_from_cam, relative_sigma, _WANTED
     )
     result: Placed | NotFound = NotFound("no landmark of the map is in view")
-    for rules in (_WIDE, _CLOSE):
-        if len(landmarks) == 0:
-            return result
-        poses[column] = pose @ view.body_from_cam
-        found = table.found(reference, poses, [column], rules)[:, column]
-        hit = np.flatnonzero(np.isfinite(found[:, 0]))
-        links = PairMatches(landmarks[hit], np.arange(len(hit), dtype=np.intp))
-        sightings = _sightings(view, links.a, found[hit], known, sure)
-        refined = refine(pose, sightings, ResectionOptions(min_inliers=_MIN_INLIERS))
-        checked = believed(view, links, refined, known, sure, options)
-        if isinstance(checked, NotFound):
-            return checked
-        pose = checked.world_from_body
-        result = Placed(pose, checked.links.a, found[hit][checked.links.b])
+    for looks in (_NEAR, _FAR):
+        if len(landmarks) == 0 or isinstance(result, Placed):
+            break
+        pose = guess
+        for look in looks:
+            poses = [*worlds_from_cams, *[pose @ view.body_from_cam] * (table.n_views - n_known)]
+            found = table.found(reference, poses, [column], look.rules, look.reach_px, look.level)[
+                :, column
+            ]
+            result = _judged(view, pose, landmarks, found, known, sure, look.noise_px, options)
+            if isinstance(result, NotFound):
+                break
+            pose = result.world_from_body
     return result
 
 
+def _judged(
+    view: DroneView,
+    pose: Pose,
+    landmarks: Index,
+    found: Array,
+    known: LandmarkMap,
+    sure: MapUncertainty,
+    noise_px: float,
+    options: MapOptions,
+) -> Placed | NotFound:
+    """Return where (M, 2) pixels of landmarks, NaN where not found, put a view."""
+    hit = np.flatnonzero(np.isfinite(found[:, 0]))
+    links = PairMatches(landmarks[hit], np.arange(len(hit), dtype=np.intp))
+    sightings = _sightings(view, links.a, found[hit], known, sure, noise_px)
+    refined = refine(pose, sightings, ResectionOptions(min_inliers=_MIN_INLIERS))
+    checked = believed(view, links, refined, known, sure, options)
+    if isinstance(checked, NotFound):
+        return checked
+    return Placed(checked.world_from_body, checked.links.a, found[hit][checked.links.b])
+
+
 def _sightings(
-    view: DroneView, landmarks: Index, pixels: Array, known: LandmarkMap, sure: MapUncertainty
+    view: DroneView,
+    landmarks: Index,
+    pixels: Array,
+    known: LandmarkMap,
+    sure: MapUncertainty,
+    noise_px: float,
 ) -> Sightings:
     ideal = view.camera.ideal_from_pixels(pixels)
     lever = sure.landmark_lever[landmarks]
@@ -142,6 +181,6 @@ def _sightings(
         view.camera.focal_px,
         view.camera.pixel_slopes(ideal),
         view.body_from_cam,
-        max(known.pixel_noise_px, _NOISE_PX),
+        max(known.pixel_noise_px, noise_px),
         np.zeros(len(landmarks)),
     )

@@ -87,24 +87,48 @@ def extended(
         return NoMap("there is no view that the map does not have already")
     try:
         sure = map_uncertainty(old)
+        growth = _grown(old, sure, views, features_of, options, seed, pyramid_of)
     except ValueError as error:
         return NoMap(str(error))
-    growth: Growth | None = None
-    if options.patches:
-        views = _guessed(old, sure, views, features_of, options, seed)
-        extension = Extension(old, sure, views, features_of, pyramid_of, options)
-        growth = extension.run()
-    if growth is None or len(growth.views) < len(views):
-        late = _by_features(old, growth, views, features_of, options, seed)
-        if isinstance(late, Growth):
-            growth = late
-        elif growth is None:
-            return late
+    if isinstance(growth, NoMap):
+        return growth
     reason = broken_continuity(old, sure, growth)
     if reason:
         return NoMap(reason)
     made = pruned(replace(growth.landmark_map, parent=parent), len(old.keyframes), options)
     return accepted(made, options)
+
+
+def _grown(
+    old: LandmarkMap,
+    sure: MapUncertainty,
+    views: list[DroneView],
+    features_of: ImageFeatures,
+    options: MapOptions,
+    seed: int,
+    pyramid_of: PyramidOf,
+) -> Growth | NoMap:
+    """Join views by patches, then the others by features on what came of it.
+
+    Raises:
+        ValueError: the map grown by patches is not fixed by what is seen.
+    """
+    growth: Growth | None = None
+    if options.patches:
+        views = _guessed(old, sure, views, features_of, options, seed)
+        growth = Extension(old, sure, views, features_of, pyramid_of, options).run()
+    if growth is None:
+        return _by_features(old, sure, views, features_of, options, seed, pyramid_of)
+    waiting = [v for i, v in enumerate(views) if i not in growth.views]
+    if not waiting:
+        return growth
+    known = growth.landmark_map
+    late = _by_features(
+        known, map_uncertainty(known), waiting, features_of, options, seed, pyramid_of
+    )
+    if isinstance(late, NoMap):
+        return growth
+    return replace(late, old=np.where(late.old >= 0, growth.old[late.old], -1))
 
 
 def _guessed(
@@ -134,16 +158,15 @@ def _guessed(
 
 
 def _by_features(
-    old: LandmarkMap,
-    growth: Growth | None,
-    views: list[DroneView],
+    known: LandmarkMap,
+    sure: MapUncertainty,
+    waiting: list[DroneView],
     features_of: ImageFeatures,
     options: MapOptions,
     seed: int,
+    pyramid_of: PyramidOf,
 ) -> Growth | NoMap:
-    """Register views that have not joined, by their features."""
-    known = growth.landmark_map if growth else old
-    waiting = [v for i, v in enumerate(views) if growth is None or i not in growth.views]
+    """Register views by their features; that done, by patches if they can be seen from there."""
     usable = []
     for view in waiting:
         try:
@@ -153,15 +176,17 @@ def _by_features(
         usable.append(replace(view, features=found))
     if not usable:
         return NoMap("no frame has come that can be used")
-    try:
-        sure = map_uncertainty(known)
-    except ValueError as error:
-        return NoMap(str(error))
     library = KeyframeLibrary(known, of_keyframes(features_of, options.detectors))
     late = _Update(known, sure, usable, library, options, seed).run()
-    if growth is None or isinstance(late, NoMap):
+    if isinstance(late, NoMap) or not options.patches:
         return late
-    return replace(late, old=np.where(late.old >= 0, growth.old[late.old], -1))
+    found_at = late.landmark_map.keyframes[len(known.keyframes) :]
+    guessed = [
+        replace(usable[i], world_from_body=k.world_from_body)
+        for i, k in zip(late.views, found_at, strict=True)
+    ]
+    sharper = Extension(known, sure, guessed, features_of, pyramid_of, options).run()
+    return sharper if sharper and len(sharper.views) == len(late.views) else late
 
 
 class _Update:
