@@ -31,7 +31,7 @@ from vcl_companion.swarm.group import SwarmOptions
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.swarm.transfer_options import TransferOptions
 from vcl_companion.swarm.updates import UpdateOptions
-from vcl_companion.vision.features import FeatureOptions
+from vcl_companion.vision.features import Detector, FeatureOptions
 
 _Section = TypeVar("_Section")
 _Path = tuple[str | int, ...]
@@ -87,6 +87,12 @@ class Config:
                 f"localization.detector: {self.localization.detector} is not in map.detectors "
                 f"{list(self.map.detectors)}"
             )
+        fallback = self.localization.fallback_detector
+        if fallback and fallback not in self.map.detectors:
+            raise ConfigError(
+                f"localization.fallback_detector: {fallback} is not in map.detectors "
+                f"{list(self.map.detectors)}; empty for none"
+            )
         if self.inter.detector not in self.map.detectors:
             raise ConfigError(
                 f"inter.detector: {self.inter.detector} is not in map.detectors "
@@ -99,6 +105,13 @@ class Config:
             raise ConfigError(
                 f"system_id: {self.system_id} is not in swarm.members {list(members)}"
             )
+
+    def recognised_by(self) -> tuple[Detector, ...]:
+        """Return the detectors by which maps are recognised, in the order in which they try."""
+        own, fallback = self.localization.detector, self.localization.fallback_detector
+        if self.pipeline == "paper" or not fallback or fallback == own:
+            return (own,)
+        return own, fallback
 
 
 def load_config(path: Path) -> Config:

@@ -107,7 +107,7 @@ class Drone:
             self.autopilot_link, demo.sensor(system_id), clock, self.log, executor,
             self.estimator,
             ExchangeOptions(
-                swarm, demo.MAP_OPTIONS, update, demo.FEATURES, "akaze", inter, tracked=False
+                swarm, demo.MAP_OPTIONS, update, demo.FEATURES, ("akaze",), inter, tracked=False
             ),
             rng,
         )  # fmt: skip

@@ -99,6 +99,21 @@ def test_the_ratio_is_against_another_landmark(n_entries: int) -> None:
     np.testing.assert_array_equal(landmarks, np.arange(30))
 
 
+@pytest.mark.parametrize("n_entries", [1, 3])
+def test_floats_are_compared_with_the_nearest_of_another_landmark(n_entries: int) -> None:
+    rng = np.random.default_rng(6)
+    places = sift_like(rng, 300)
+    places[1] = places[0]  # two alike: both refused
+    noise = 0.02 * rng.standard_normal((n_entries, *places.shape))
+    entries = (places + noise).reshape(-1, places.shape[1]).astype(np.float32)
+    order = rng.permutation(300)
+    found, landmarks = match_to_entries(
+        features(places[order]), features(entries), np.tile(np.arange(300), n_entries), OPTIONS
+    )
+    np.testing.assert_array_equal(order[found], landmarks)
+    np.testing.assert_array_equal(np.sort(landmarks), np.arange(2, 300))
+
+
 @pytest.mark.parametrize("n_entries", [1, 3, 4, 6])
 def test_two_alike_landmarks_are_both_refused(n_entries: int) -> None:
     rng = np.random.default_rng(5)

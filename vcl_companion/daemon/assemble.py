@@ -116,7 +116,7 @@ async def _run(config: Config) -> int:
             replace(config.map, patches=config.map.patches and config.pipeline == "default"),
             config.update,
             config.features,
-            config.localization.detector,
+            config.recognised_by(),
             config.inter,
             tracked=config.pipeline == "default",
         ),

@@ -69,7 +69,7 @@ class ExchangeOptions:
     map: MapOptions
     update: UpdateOptions
     features: FeatureOptions
-    detector: Detector
+    detectors: tuple[Detector, ...]
     inter: InterMavOptions
     tracked: bool
 
@@ -155,7 +155,7 @@ class Exchange:
             executor,
             self._tell_state,
             self._refusals.count,
-            options.detector,
+            options.detectors,
             options.features,
             memory,
             options.update.delivery_wait_s,

@@ -202,8 +202,11 @@ class _Look:
         return found
 
     def _index_of(self, stored: StoredMap) -> MapIndex:
-        if stored.index.detector == self._options.detector:
-            return stored.index
+        known: MapIndex | None = stored.index
+        while known is not None:
+            if known.detector == self._options.detector:
+                return known
+            known = known.fallback
         if self._index is None or self._index[0] != stored.revision:
             index = index_map(stored.index.landmark_map, self._options.detector, self._features)
             self._index = (stored.revision, index)

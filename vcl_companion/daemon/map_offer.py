@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.localization.map_index import MapIndex, index_map
-from vcl_companion.mapping.landmark_map import Keyframe
+from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.vision.features import Detector, FeatureOptions, Features
 from vcl_companion.wire.header import BlobKind
@@ -56,7 +56,7 @@ class ReadyMap:
 def ready_map(
     offer: MapOffer,
     current: StoredMap | None,
-    detector: Detector,
+    detectors: tuple[Detector, ...],
     features: FeatureOptions,
     memory: FeatureMemory,
     tracked: bool,
@@ -66,7 +66,7 @@ def ready_map(
     Args:
         offer: what came or was made.
         current: the map in use, perhaps its parent.
-        detector: the localization's own.
+        detectors: the localization's own, and what it falls back on.
         features: how they are found.
         memory: finds them.
         tracked: whether the map is also made ready to be tracked.
@@ -84,11 +84,38 @@ def ready_map(
     else:
         data, update = decode_map_update(offer.blob, parent), offer.blob
 
-    def features_of(keyframe: Keyframe) -> Features:
-        return memory.features(keyframe.image_bytes, keyframe.camera, detector)
-
-    index = index_map(decode_map(data), detector, features, features_of)
+    landmark_map = decode_map(data)
+    index = _indexed(landmark_map, detectors, features, memory)
     if parent is not None and not update:
         update = encode_map_update(data, parent)
     templates = prepare_templates(index.landmark_map, index.uncertainty) if tracked else None
     return ReadyMap(data, index, update, templates)
+
+
+def _indexed(
+    landmark_map: LandmarkMap,
+    detectors: tuple[Detector, ...],
+    features: FeatureOptions,
+    memory: FeatureMemory,
+) -> MapIndex:
+    """Make a map ready to be recognised by the first detector, and after that by the others.
+
+    Raises:
+        ValueError: the first one finds nothing of it, or it is not determined.
+    """
+    index: MapIndex | None = None
+    for detector in reversed(detectors):
+
+        def features_of(keyframe: Keyframe, detector: Detector = detector) -> Features:
+            return memory.features(keyframe.image_bytes, keyframe.camera, detector)
+
+        uncertainty = None if index is None else index.uncertainty
+        try:
+            found = index_map(landmark_map, detector, features, features_of, uncertainty)
+        except ValueError:
+            if detector == detectors[0]:
+                raise
+            continue
+        index = replace(found, fallback=index)
+    assert index is not None
+    return index

@@ -59,7 +59,7 @@ class MapSharing:
         executor: runs decoding, indexing and writing.
         tell_state: tells peers which map we fly on.
         refuse: counts what a peer sent in vain: peer, kind, detail.
-        detector: the localization's own.
+        detectors: the localization's own, and what it falls back on.
         features: how they are found.
         memory: finds them; only the executor's thread uses it.
         delivery_wait_s: how long a coordinator that is back with a map which we
@@ -76,7 +76,7 @@ class MapSharing:
         executor: Executor,
         tell_state: Callable[[], None],
         refuse: Callable[[int, str, str], None],
-        detector: Detector,
+        detectors: tuple[Detector, ...],
         features: FeatureOptions,
         memory: FeatureMemory,
         delivery_wait_s: float,
@@ -89,7 +89,7 @@ class MapSharing:
         self._executor = executor
         self._tell_state = tell_state
         self._refuse = refuse
-        self._detector: Detector = detector
+        self._detectors = detectors
         self._features = features
         self._memory = memory
         self._delivery_wait_s = delivery_wait_s
@@ -248,7 +248,7 @@ class MapSharing:
                 ready_map,
                 offer,
                 self._maps.current,
-                self._detector,
+                self._detectors,
                 self._features,
                 self._memory,
                 self._tracked,

@@ -39,6 +39,7 @@ class LocalizationOptions:
 
     Attributes:
         detector: features to look for; must be among those the maps are built with.
+        fallback_detector: looked for when a frame was not recognised by those; empty for none.
         min_inliers: landmarks that must agree on a pose.
         guided_radius_px: largest uncertainty of a prediction that still guides the matching.
         noise_floor_px: pixel noise is never taken for smaller than this, 1 sigma.
@@ -51,6 +52,7 @@ class LocalizationOptions:
     """
 
     detector: Detector = "akaze"
+    fallback_detector: Detector | Literal[""] = "sift"
     min_inliers: int = 15
     guided_radius_px: float = 40.0
     noise_floor_px: float = 0.4

@@ -32,6 +32,7 @@ class MapIndex:
         owner: (M,) landmark of each entry.
         detector: what made the descriptors.
         search: the descriptors as they are searched; None when they are not binary.
+        fallback: the same map by another detector, tried when this one fails; None for none.
     """
 
     landmark_map: LandmarkMap
@@ -41,6 +42,7 @@ class MapIndex:
     owner: NDArray[np.intp]
     detector: Detector
     search: HammingIndex | None = None
+    fallback: MapIndex | None = None
 
 
 def index_map(
@@ -48,6 +50,7 @@ def index_map(
     detector: Detector,
     options: FeatureOptions,
     features_of: Callable[[Keyframe], Features] | None = None,
+    uncertainty: MapUncertainty | None = None,
 ) -> MapIndex:
     """Derive descriptors from the keyframe images, and the covariance from the geometry.
 
@@ -57,6 +60,7 @@ def index_map(
             the geometry only.
         options: as used when the map was built.
         features_of: knows what this detector finds in a keyframe; None: it is looked for.
+        uncertainty: of the map, if that is known already.
 
     Raises:
         ValueError: an image cannot be decoded, or the map is not determined.
@@ -78,7 +82,7 @@ def index_map(
         owners.append(seen[found])
     if not owners or sum(map(len, owners)) == 0:
         raise ValueError(f"the map has no landmark that {detector} finds again in its keyframes")
-    uncertainty = map_uncertainty(landmark_map)
+    uncertainty = uncertainty or map_uncertainty(landmark_map)
     entries = Features(np.concatenate(pixels), np.concatenate(descriptors))
     owner = np.concatenate(owners).astype(np.intp)
     search = None

@@ -72,10 +72,7 @@ def localize(
         )  # fmt: skip
         if isinstance(tracked, Localized):
             return tracked
-    found = localize_intra(
-        detect(image, index.detector, options.features),
-        camera, body_from_cam, index, prior, ned_from_body, options.localization,
-    )  # fmt: skip
+    found = _recognised(image, camera, body_from_cam, index, prior, ned_from_body, options)
     if templates is None or isinstance(found, NotLocalized):
         return found
     closer = track(
@@ -84,3 +81,22 @@ def localize(
         options.tracking, options.localization,
     )  # fmt: skip
     return closer if isinstance(closer, Localized) else found
+
+
+def _recognised(
+    image: Image,
+    camera: Camera,
+    body_from_cam: Pose,
+    index: MapIndex,
+    prior: Prior | None,
+    ned_from_body: Array | None,
+    options: PipelineOptions,
+) -> Localized | NotLocalized:
+    """Find the pose by features of one detector after the other."""
+    found = localize_intra(
+        detect(image, index.detector, options.features),
+        camera, body_from_cam, index, prior, ned_from_body, options.localization,
+    )  # fmt: skip
+    if isinstance(found, Localized) or index.fallback is None:
+        return found
+    return _recognised(image, camera, body_from_cam, index.fallback, prior, ned_from_body, options)

@@ -15,6 +15,9 @@ from vcl_companion.vision.hamming import FAR, HammingIndex, hamming_index, neare
 
 Index = NDArray[np.intp]
 
+# Features compared with a whole map at a time: a few megabytes of distances.
+_AT_ONCE = 128
+
 
 @dataclass(frozen=True)
 class MatchOptions:
@@ -83,19 +86,9 @@ def match_to_entries(
             landmark.astype(np.intp),
             nearest.astype(np.float64),
         )
-    # As many neighbours as it takes to be sure of another landmark among them.
-    n_own = int(np.unique(owner, return_counts=True)[1].max())
-    best, distance = _knn(cv2.BFMatcher(_norm(features)), features, entries, n_own + 1)
-    owners = owner[best]
-    other = owners != owners[:, :1]
-    second = np.where(
-        other.any(axis=1),
-        distance[np.arange(len(best)), other.argmax(axis=1)],
-        _worst(features),
-    )
-    return _one_to_one(
-        np.flatnonzero(distance[:, 0] < options.ratio * second), owners[:, 0], distance[:, 0]
-    )
+    nearest, distance, second = _nearest_two(features, entries, owner)
+    limit = options.ratio * np.where(np.isfinite(second), second, _worst(features))
+    return _one_to_one(np.flatnonzero(distance < limit), owner[nearest], distance)
 
 
 def match_guided(
@@ -183,6 +176,29 @@ def _knn(matcher: cv2.BFMatcher, a: Features, b: Features, k: int) -> tuple[Inde
         index = np.pad(index, ((0, 0), (0, missing)), mode="edge")
         distance = np.pad(distance, ((0, 0), (0, missing)), mode="edge")
     return index, distance
+
+
+def _nearest_two(features: Features, entries: Features, owner: Index) -> tuple[Index, Array, Array]:
+    """Return (N,) nearest entries, their distances, and those of the nearest of another owner.
+
+    By one product of matrices for some features at a time: for descriptors of numbers that
+    is many times faster than looking at one pair after the other.
+    """
+    n = len(features)
+    nearest = np.empty(n, dtype=np.intp)
+    squared, other = np.empty(n), np.empty(n)
+    sizes = np.einsum("md,md->m", entries.descriptors, entries.descriptors)
+    for begin in range(0, n, _AT_ONCE):
+        part = features.descriptors[begin : begin + _AT_ONCE]
+        rows = np.arange(len(part))
+        apart = sizes - 2.0 * (part @ entries.descriptors.T)
+        best = apart.argmin(axis=1)
+        least = apart[rows, best]
+        apart[owner[best][:, None] == owner] = np.inf
+        own = np.einsum("nd,nd->n", part, part)
+        here = slice(begin, begin + len(part))
+        nearest[here], squared[here], other[here] = best, least + own, apart.min(axis=1) + own
+    return nearest, np.sqrt(np.maximum(squared, 0.0)), np.sqrt(np.maximum(other, 0.0))
 
 
 def _distances(a: Features, i: Index, b: Features, j: Index) -> Array:
