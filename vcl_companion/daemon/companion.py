@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from concurrent.futures import Executor
+from dataclasses import dataclass
 
 from vcl_companion.cameras.source import CameraSource, Frame
 from vcl_companion.daemon.estimator import Estimator
@@ -30,6 +31,23 @@ _log = logging.getLogger(__name__)
 ATTITUDE_WAIT_S = 0.1
 # How long the last frames of a stream may take.
 _LAST_FRAMES_S = 5.0
+# How long a frame that the map does not know waits for one that it may have gone into itself.
+_NEXT_MAP_S = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class _AskedPeers:
+    """A frame that peers are asked about.
+
+    Attributes:
+        asked: the request.
+        stored: the map that it is about.
+        refused: why the frame itself gave no pose; None where it did.
+    """
+
+    asked: Asked
+    stored: StoredMap
+    refused: NotLocalized | None
 
 
 class Companion:
@@ -79,6 +97,7 @@ class Companion:
         self._options = options
         self._mailbox = Mailbox()
         self._over = asyncio.Event()
+        self._vain: StoredMap | None = None
 
     async def read_camera(self) -> None:
         """Move frames from the camera to the mailbox until the stream ends and all are answered.
@@ -106,35 +125,51 @@ class Companion:
                     continue
                 asked = await self._localize(frame, stored)
                 if asked is not None:
-                    asking.create_task(self._hear_peers(asked[0], stored, asked[1]))
+                    asking.create_task(self._hear_peers(asked))
 
     async def _first_map(self, frame: Frame) -> StoredMap | None:
         """Wait for a first map as long as no newer frame comes; answer the frame if none does."""
-        decided = asyncio.ensure_future(self._maps.decided())
-        newer = asyncio.ensure_future(self._mailbox.filled())
-        over = asyncio.ensure_future(self._over.wait())
-        try:
-            with self._health.waiting_for_map():
-                await asyncio.wait({decided, newer, over}, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for waiting in (decided, newer, over):
-                waiting.cancel()
+        with self._health.waiting_for_map():
+            await self._unless_newer(self._maps.decided())
         if self._maps.current is None:
             self._outcomes.refuse(frame, self._no_map())
         return self._maps.current
+
+    async def _next_map(self, stored: StoredMap) -> StoredMap | None:
+        """Wait for a map that may know a place which this one does not, while no frame comes.
+
+        A frame that is not recognised shows where the map has a gap, and is among those that
+        fill it. Where none came in time for one frame the next ones do not wait.
+        """
+        if stored is not self._vain and self._maps.current is stored:
+            await self._unless_newer(self._maps.newer_than(stored), _NEXT_MAP_S)
+            if self._maps.current is stored and not self._mailbox.is_filled:
+                self._vain = stored
+        return None if self._maps.current is stored else self._maps.current
+
+    async def _unless_newer(
+        self, awaited: Coroutine[None, None, object], within_s: float | None = None
+    ) -> None:
+        """Wait for something, until a newer frame comes or the stream is over."""
+        waiting = [
+            asyncio.ensure_future(one)
+            for one in (awaited, self._mailbox.filled(), self._over.wait())
+        ]
+        try:
+            await asyncio.wait(waiting, timeout=within_s, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for one in waiting:
+                one.cancel()
 
     def _no_map(self) -> NotLocalized:
         ended = "the camera's stream is over" if self._over.is_set() else "none yet"
         return NotLocalized(f"no map: {self._maps.refusal or ended}")
 
-    async def _localize(
-        self, frame: Frame, stored: StoredMap
-    ) -> tuple[Asked, NotLocalized | None] | None:
+    async def _localize(self, frame: Frame, stored: StoredMap) -> _AskedPeers | None:
         """Localize a frame by the map, and answer it unless peers are asked about it as well.
 
         Returns:
-            The request to peers, and why the frame itself gave no pose; None
-            when nobody is asked and the frame is answered.
+            What they are asked; None when nobody is and the frame is answered.
         """
         at_ns = frame.captured_at_ns
         attitude = await self._autopilot.attitude_at(at_ns, ATTITUDE_WAIT_S)
@@ -156,11 +191,20 @@ class Companion:
         sigma_m = math.inf if refused else self._estimator.sigma_m
         asked = self._inter.begin(frame, ned_from_body, stored.revision, sigma_m)
         if asked is not None:
-            return asked, refused
+            return _AskedPeers(asked, stored, refused)
         if refused is None:
             self._outcomes.close(frame)
-        else:
-            self._outcomes.refuse(frame, refused)
+            return None
+        return await self._given_up(frame, stored, refused)
+
+    async def _given_up(
+        self, frame: Frame, stored: StoredMap, refused: NotLocalized
+    ) -> _AskedPeers | None:
+        """Answer a frame that nobody could place, unless a newer map comes that may place it."""
+        newer = await self._next_map(stored)
+        if newer is not None:
+            return await self._localize(frame, newer)
+        self._outcomes.refuse(frame, refused)
         return None
 
     def _take(
@@ -186,23 +230,24 @@ class Companion:
             return state
         return self._send(frame, state, "intra", fix.n_matched, fix.n_inliers, fix.by)
 
-    async def _hear_peers(
-        self, asked: Asked, stored: StoredMap, refused: NotLocalized | None
-    ) -> None:
+    async def _hear_peers(self, open_frame: _AskedPeers) -> None:
         """Fuse what peers say of a frame, answer it, and fuse what comes too late for that."""
-        state = None
+        asked, stored, refused = open_frame.asked, open_frame.stored, open_frame.refused
+        state = again = None
         for host, proposal in await self._inter.ask(asked):
             state = self._fuse(host, proposal, asked, stored) or state
         if refused is None:
             self._outcomes.close(asked.frame, None if state is None else "fused")
         elif state is None:
-            self._outcomes.refuse(asked.frame, refused)
+            again = await self._given_up(asked.frame, stored, refused)
         else:
             unsent = self._send(asked.frame, state, "inter")
             if unsent is None:
                 self._outcomes.close(asked.frame)
             else:
                 self._outcomes.refuse(asked.frame, unsent)
+        if again is not None:
+            await self._hear_peers(again)
         for host, proposal in await self._inter.stragglers(asked):
             self._fuse(host, proposal, asked, stored)
 

@@ -23,6 +23,11 @@ class Mailbox:
         self._filled.set()
         return replaced
 
+    @property
+    def is_filled(self) -> bool:
+        """Whether a frame is here."""
+        return self._frame is not None
+
     async def filled(self) -> None:
         """Wait until a frame is here; leave it."""
         while self._frame is None:

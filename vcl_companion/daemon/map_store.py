@@ -116,6 +116,12 @@ class MapStore:
             await self._decided.wait()
         return self.current
 
+    async def newer_than(self, stored: StoredMap) -> None:
+        """Wait until another map than this one is in use."""
+        while self.current is stored:
+            self._decided.clear()
+            await self._decided.wait()
+
     def keep(self, stored: StoredMap) -> None:
         """Write a revision to the directory; takes as long as the disk does, any thread may.
 
