@@ -24,7 +24,8 @@ from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.recording import Recording, read_recording
 from vcl_companion.recording.images import load_image
 from vcl_companion.recording.sensor import Sensor
-from vcl_companion.vision.features import FeatureOptions
+from vcl_companion.vision.features import FeatureOptions, Features
+from vcl_companion.vision.hamming import hamming_index
 from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
 
@@ -134,6 +135,13 @@ def update_index() -> MapIndex:
 @functools.cache
 def map_index(*system_ids: int) -> MapIndex:
     return index_map(decode_map(encoded_map(*system_ids)), "akaze", FEATURES)
+
+
+def unrecognisable(index: MapIndex) -> MapIndex:
+    """The same map by a detector that sees nothing special in any of it."""
+    blank = np.zeros_like(index.entries.descriptors, dtype=np.uint8)
+    entries = Features(index.entries.pixels, blank)
+    return replace(index, entries=entries, search=hamming_index(blank, index.owner))
 
 
 @functools.cache

@@ -72,6 +72,7 @@ async def flying(
             drone.log,
             stack.enter_context(ThreadPoolExecutor(1)),
             options,
+            frame_wait_s=0.1,
         )
         await stack.enter_async_context(beside(companion.read_camera(), companion.run()))
         await server.connected()

@@ -188,6 +188,7 @@ class Flyer(Drone):
                 self.autopilot_link, self.maps, self.estimator, self.exchange.inter,
                 self.exchange.on_frame, health, self.log, executor,
                 PipelineOptions(demo.FEATURES, LocalizationOptions(), TrackingOptions()),
+                frame_wait_s=0.1,
             )  # fmt: skip
             try:
                 async with asyncio.TaskGroup() as parts:

@@ -73,6 +73,11 @@ class Flight:
         patches = demo.templates(*ids)
         self.maps.replace(demo.encoded_map(*ids), demo.map_index(*ids), templates=patches)
 
+    def fly_on_nothing_known(self) -> None:
+        """On a map in which no feature is recognised."""
+        index = demo.unrecognisable(demo.map_index(1, 2, 3))
+        self.maps.replace(demo.encoded_map(1, 2), index)
+
     def end_stream(self, k: int) -> None:
         self.server.say_end(demo.shot(DRONE, k).at_ns)
 
@@ -96,7 +101,7 @@ def nobody_to_ask(executor: ThreadPoolExecutor, clock: ManualClock) -> InterTarg
 
 
 @contextlib.asynccontextmanager
-async def flight(path: Path) -> AsyncIterator[Flight]:
+async def flight(path: Path, frame_wait_s: float = 0.1) -> AsyncIterator[Flight]:
     """A companion with everything around it; its own two coroutines do not run yet."""
     first = demo.shot(DRONE)
     clock = ManualClock(first.at_ns)
@@ -119,7 +124,7 @@ async def flight(path: Path) -> AsyncIterator[Flight]:
         estimator = Estimator(FilterOptions(), OPTIONS.localization, lambda _: None)
         companion = Companion(
             camera, outcomes, sensor, link, maps, estimator, nobody_to_ask(executor, clock),
-            history.add, health, log, executor, OPTIONS,
+            history.add, health, log, executor, OPTIONS, frame_wait_s,
         )  # fmt: skip
         await stack.enter_async_context(beside(link.run()))
         assert await link.attitude_at(first.at_ns, 5.0) is not None
@@ -139,9 +144,12 @@ async def flight(path: Path) -> AsyncIterator[Flight]:
 
 
 @contextlib.asynccontextmanager
-async def flying(path: Path) -> AsyncIterator[Flight]:
+async def flying(path: Path, frame_wait_s: float = 0.1) -> AsyncIterator[Flight]:
     """The same, in flight."""
-    async with flight(path) as up, beside(up.companion.read_camera(), up.companion.run()):
+    async with (
+        flight(path, frame_wait_s) as up,
+        beside(up.companion.read_camera(), up.companion.run()),
+    ):
         await up.server.connected()
         yield up
 
@@ -281,6 +289,36 @@ def test_frames_that_never_reached_us_are_counted(tmp_path: Path) -> None:
             up.give(1, sequence=7)
             await until(lambda: 7 in up.server.outcomes)
             assert up.log.frames == {"localized": 2, "refused": 0, "dropped": 3}
+
+    run(scenario())
+
+
+def test_a_frame_the_map_does_not_know_is_localized_on_the_next_one(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path, frame_wait_s=60.0) as up:
+            up.fly_on_nothing_known()
+            up.give(0)
+            await until(lambda: up.estimator.tracked == 0 and up.maps.current is not None)
+            up.fly_on_a_map()
+            await up.server.answered()
+            assert up.frames() == [(0, "localized", None)]
+
+    run(scenario())
+
+
+def test_a_newer_frame_ends_the_wait_for_the_next_map(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path, frame_wait_s=60.0) as up:
+            up.fly_on_nothing_known()
+            up.give(0)
+            up.give(1)
+            await until(lambda: 0 in up.server.outcomes)
+            up.fly_on_a_map()
+            await up.server.answered()
+            (first, outcome, _), second = up.frames()
+            assert first == 0
+            assert outcome in ("refused", "dropped")
+            assert second == (1, "localized", None)
 
     run(scenario())
 

@@ -18,24 +18,16 @@ from vcl_companion.localization.intra import (
     Prior,
     Recognised,
 )
-from vcl_companion.localization.map_index import MapIndex, index_map
+from vcl_companion.localization.map_index import index_map
 from vcl_companion.localization.pipeline import PipelineOptions, localize
 from vcl_companion.localization.tracking import TrackingOptions
-from vcl_companion.vision.features import Features, Image
-from vcl_companion.vision.hamming import hamming_index
+from vcl_companion.vision.features import Image
 
 DRONE, FRAME = 2, 4
 OPTIONS = PipelineOptions(demo.FEATURES, LocalizationOptions(), TrackingOptions())
 PAPER, DEFAULT = False, True
 _SIGMA = np.diag(np.repeat([0.1, 0.01], 3) ** 2)
 _OFF = np.array([0.08, -0.08, 0.08, 0.008, -0.008, 0.008])
-
-
-def unrecognisable(index: MapIndex) -> MapIndex:
-    """The same map by a detector that sees nothing special in any of it."""
-    blank = np.zeros_like(index.entries.descriptors, dtype=np.uint8)
-    entries = Features(index.entries.pixels, blank)
-    return replace(index, entries=entries, search=hamming_index(blank, index.owner))
 
 
 def answered(
@@ -47,7 +39,7 @@ def answered(
     """A frame of the demo against the map of the drones' first frames."""
     index, sensor = demo.map_index(1, 2, 3), demo.sensor(DRONE)
     if not recognisable:
-        index = unrecognisable(index)
+        index = demo.unrecognisable(index)
     shot = demo.shot(DRONE, FRAME)
     return localize(
         shot.image if image is None else image, sensor.camera, sensor.body_from_cam,
@@ -103,7 +95,7 @@ def test_a_prediction_that_is_wrong_is_got_over(moved: Pose) -> None:
 
 def test_what_one_detector_does_not_recognise_another_may() -> None:
     shot, sensor = demo.shot(DRONE, FRAME), demo.sensor(DRONE)
-    akaze = unrecognisable(demo.map_index(1, 2, 3))
+    akaze = demo.unrecognisable(demo.map_index(1, 2, 3))
     sift = index_map(akaze.landmark_map, "sift", OPTIONS.features)
     for fallback, recognised in ((None, False), (sift, True)):
         fix = localize(

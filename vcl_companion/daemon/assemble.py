@@ -135,6 +135,7 @@ async def _run(config: Config) -> int:
         log,
         vision,
         PipelineOptions(config.features, config.localization, config.tracking),
+        config.update.frame_wait_s,
     )
     peers = PeerLink(
         config.peers,

@@ -31,8 +31,6 @@ _log = logging.getLogger(__name__)
 ATTITUDE_WAIT_S = 0.1
 # How long the last frames of a stream may take.
 _LAST_FRAMES_S = 5.0
-# How long a frame that the map does not know waits for one that it may have gone into itself.
-_NEXT_MAP_S = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +64,8 @@ class Companion:
         log: told of every estimate.
         executor: runs the vision, beside the event loop.
         options: of the steps.
+        frame_wait_s: how long a frame that the map does not know waits for the next
+            map, which it may have gone into itself, while no newer frame comes.
     """
 
     def __init__(
@@ -82,6 +82,7 @@ class Companion:
         log: FlightLog,
         executor: Executor,
         options: PipelineOptions,
+        frame_wait_s: float,
     ) -> None:
         self._camera = camera
         self._outcomes = outcomes
@@ -95,6 +96,7 @@ class Companion:
         self._log = log
         self._executor = executor
         self._options = options
+        self._frame_wait_s = frame_wait_s
         self._mailbox = Mailbox()
         self._over = asyncio.Event()
         self._vain: StoredMap | None = None
@@ -142,7 +144,8 @@ class Companion:
         fill it. Where none came in time for one frame the next ones do not wait.
         """
         if stored is not self._vain and self._maps.current is stored:
-            await self._unless_newer(self._maps.newer_than(stored), _NEXT_MAP_S)
+            with self._health.waiting_for_map():
+                await self._unless_newer(self._maps.newer_than(stored), self._frame_wait_s)
             if self._maps.current is stored and not self._mailbox.is_filled:
                 self._vain = stored
         return None if self._maps.current is stored else self._maps.current
@@ -201,6 +204,7 @@ class Companion:
         self, frame: Frame, stored: StoredMap, refused: NotLocalized
     ) -> _AskedPeers | None:
         """Answer a frame that nobody could place, unless a newer map comes that may place it."""
+        self._health.refused(refused.reason)
         newer = await self._next_map(stored)
         if newer is not None:
             return await self._localize(frame, newer)

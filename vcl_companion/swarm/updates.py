@@ -55,6 +55,8 @@ class UpdateOptions:
         lost_s: a member that has not localized for so long sends several frames.
         joiner_frames: how many.
         joiner_spacing_s: time between them.
+        frame_wait_s: how long a frame that the map does not know waits for the next
+            revision, while no newer frame comes.
     """
 
     # A round takes seconds, and in fast flight landmarks halve in five: after two halvings
@@ -73,6 +75,7 @@ class UpdateOptions:
     lost_s: float = 3.0
     joiner_frames: int = 4
     joiner_spacing_s: float = 1.5
+    frame_wait_s: float = 10.0
 
     def __post_init__(self) -> None:
         if self.tracked < 0:
@@ -91,6 +94,7 @@ class UpdateOptions:
             "delivery_wait_s",
             "lost_s",
             "joiner_spacing_s",
+            "frame_wait_s",
         ):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
