@@ -19,7 +19,9 @@ from typing import Any
 
 import msgspec
 
+from sitl.default_goals import default_goals
 from sitl.fly import Progress
+from sitl.goals import Goal
 from sitl.paper_experiments import (
     EXPERIMENTS,
     PIPELINES,
@@ -30,7 +32,7 @@ from sitl.paper_experiments import (
     settings_of,
 )
 from sitl.paper_flights import PaperFlight, flown, variant_name
-from sitl.paper_goals import Goal, goals
+from sitl.paper_goals import goals
 from sitl.paper_measures import compared, flight_measures
 from sitl.paper_page import page
 from sitl.paper_recordings import Rendered, rendered
@@ -120,7 +122,8 @@ def make_paper(
                          progress, say)  # fmt: skip
         for pipeline in pipelines:
             flights = result.flights.setdefault(pipeline.name, {})
-            rows = goals(flights, whole=result.whole)
+            asked_of = default_goals if pipeline.name == "default" else goals
+            rows = asked_of(flights, whole=result.whole)
             names = ("", *(experiment.name for experiment in asked))
             result.goals[pipeline.name] = [goal for goal in rows if goal.experiment in names]
         progress("writing the page", 0, 0)

@@ -7,23 +7,17 @@ is called ours.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 
+from sitl.goals import Flights, Goal, Verdict, at_most, cm, judged, not_flown, rmse_cm
 from sitl.paper_estimates import nees_median
 from sitl.paper_experiments import TABLE_I, AxisErrors
 from sitl.paper_flights import PaperFlight
 from sitl.paper_measures import after_first_map, compared, drone_measures
 from sitl.result import DroneResult
 from vcl_companion.geometry.rotation import Array
-
-Verdict = Literal["met", "not met", "reported", "not judged"]
-# Flights of one pipeline by (experiment, fused).
-Flights = Mapping[tuple[str, bool], PaperFlight]
 
 YAW_RMSE_DEG, YAW_WORST_DEG = 0.15, 0.5
 FUSED_RMSE_CM = 24.0
@@ -36,25 +30,6 @@ _NEAR_DEG = 30.0
 _KEPT_SHARE = 0.95
 
 
-@dataclass(frozen=True)
-class Goal:
-    """One row.
-
-    Attributes:
-        experiment: its name; empty: all.
-        what: what must be shown.
-        goal: the number.
-        measured: ours.
-        verdict: whether that meets it.
-    """
-
-    experiment: str
-    what: str
-    goal: str
-    measured: str
-    verdict: Verdict
-
-
 def goals(flights: Flights, *, whole: bool) -> list[Goal]:
     """Return every row for one pipeline.
 
@@ -63,31 +38,26 @@ def goals(flights: Flights, *, whole: bool) -> list[Goal]:
         whole: False when the recordings were cut short: then nothing is judged.
     """
     rows = [
-        *_rotate(flights.get(("rotate", True))),
+        *rotate(flights.get(("rotate", True))),
         _sparse(flights.get(("sparse", True)), flights.get(("sparse", False))),
         *_forward_back(flights),
         *_urban(flights.get(("urban", True))),
         *_nees(flights),
     ]
-    if whole:
-        return rows
-    return [
-        Goal(g.experiment, g.what, g.goal, g.measured,
-             "not judged" if g.verdict in ("met", "not met") else g.verdict)
-        for g in rows
-    ]  # fmt: skip
+    return judged(rows, whole)
 
 
-def _rotate(flight: PaperFlight | None) -> list[Goal]:
+def rotate(flight: PaperFlight | None) -> list[Goal]:
+    """Return the rows of the drone that turns in place."""
     what = "yaw RMSE of the turning drone", "its worst frame", "source switching as in fig. 5"
     asked = f"≤ {YAW_RMSE_DEG}°", f"≤ {YAW_WORST_DEG}°", "at either building its own observer"
     if flight is None:
-        return [_not_flown("rotate", w, g) for w, g in zip(what, asked, strict=True)]
+        return [not_flown("rotate", w, g) for w, g in zip(what, asked, strict=True)]
     name = flight.experiment.targets[0]
     drone = drone_measures(flight, flight.drone(name), None)
     out = [
-        _at_most("rotate", what[0], asked[0], drone["yaw_rmse_deg"], YAW_RMSE_DEG, "{:.3f}°"),
-        _at_most("rotate", what[1], asked[1], drone["yaw_worst_deg"], YAW_WORST_DEG, "{:.2f}°"),
+        at_most("rotate", what[0], asked[0], drone["yaw_rmse_deg"], YAW_RMSE_DEG, "{:.3f}°"),
+        at_most("rotate", what[1], asked[1], drone["yaw_worst_deg"], YAW_WORST_DEG, "{:.2f}°"),
     ]
     told = _switching(flight, name)
     if told is None:
@@ -146,7 +116,7 @@ def _sparse(fused: PaperFlight | None, unfused: PaperFlight | None) -> Goal:
     what = "inter-MAV keeps both targets where intra alone fails"
     asked = f"both ≥ {100 * _KEPT_SHARE:.0f} % of frames localized (ours), more than without"
     if fused is None or unfused is None:
-        return _not_flown("sparse", what, asked)
+        return not_flown("sparse", what, asked)
     told, fine = [], True
     for name in fused.experiment.targets:
         a = drone_measures(fused, fused.drone(name), None)
@@ -155,42 +125,43 @@ def _sparse(fused: PaperFlight | None, unfused: PaperFlight | None) -> Goal:
         fine = fine and share >= _KEPT_SHARE and share > without
         told.append(
             f"{name}: {100 * share:.0f} % ({100 * without:.0f} %), "
-            f"ATE {_cm(a['rmse_3d_cm'])} ({_cm(b['rmse_3d_cm'])})"
+            f"ATE {cm(a['rmse_3d_cm'])} ({cm(b['rmse_3d_cm'])})"
         )
     measured = f"{'; '.join(told)} — with (without)"
     return Goal("sparse", what, asked, measured, "met" if fine else "not met")
 
 
 def _forward_back(flights: Flights) -> list[Goal]:
-    fused, unfused = flights.get(("forward_back", True)), flights.get(("forward_back", False))
+    fused = flights.get(("forward_back", True))
     near = flights.get(("forward_back_near", True))
     of_paper = " and ".join(f"{_norm(TABLE_I[n]):.1f}" for n in TABLE_I)
     out = []
     what = "fused 3-D RMSE of MAV 1 and 2"
     asked = f"≤ {FUSED_RMSE_CM:.0f} cm (the paper: {of_paper})"
     if fused is None:
-        out.append(_not_flown("forward_back", what, asked))
+        out.append(not_flown("forward_back", what, asked))
     else:
-        rmse = {n: _rmse_cm(fused, n) for n in fused.experiment.targets}
+        rmse = {n: rmse_cm(fused, n) for n in fused.experiment.targets}
         fine = all(value is not None and value <= FUSED_RMSE_CM for value in rmse.values())
-        told = ", ".join(f"{n} {_cm(value)}" for n, value in rmse.items())
+        told = ", ".join(f"{n} {cm(value)}" for n, value in rmse.items())
         out.append(Goal("forward_back", what, asked, told, "met" if fine else "not met"))
-    what, asked = "fusion never more than 5 % worse", f"fused ≤ {WORSE_AT_MOST} × unfused"
-    if fused is None or unfused is None:
-        out.append(_not_flown("forward_back", what, asked))
-    else:
-        out.append(_never_worse(fused, unfused, what, asked))
+    out.append(never_worse(flights))
     what, asked = "the nearer, harder flight", "reported as it is"
     if near is None:
-        return [*out, _not_flown("forward_back_near", what, asked)]
+        return [*out, not_flown("forward_back_near", what, asked)]
     told = ", ".join(
-        f"{d.name} {_cm(_rmse_cm(near, d.name))} in {100 * d.n_localized / d.n_frames:.0f} %"
+        f"{d.name} {cm(rmse_cm(near, d.name))} in {100 * d.n_localized / d.n_frames:.0f} %"
         for d in near.result.drones
     )
     return [*out, Goal("forward_back_near", what, asked, f"{told} of frames", "reported")]
 
 
-def _never_worse(fused: PaperFlight, unfused: PaperFlight, what: str, asked: str) -> Goal:
+def never_worse(flights: Flights) -> Goal:
+    """Return whether fusing with peers did harm where both were flown."""
+    fused, unfused = flights.get(("forward_back", True)), flights.get(("forward_back", False))
+    what, asked = "fusion never more than 5 % worse", f"fused ≤ {WORSE_AT_MOST} × unfused"
+    if fused is None or unfused is None:
+        return not_flown("forward_back", what, asked)
     ratios = {}
     for drone in fused.result.drones:
         pair = compared(drone, unfused.drone(drone.name))
@@ -205,7 +176,7 @@ def _never_worse(fused: PaperFlight, unfused: PaperFlight, what: str, asked: str
 def _urban(flight: PaperFlight | None) -> list[Goal]:
     what = "every frame after the first map localized, or refused with a reason", "final drift"
     if flight is None:
-        return [_not_flown("urban", what[0], "all"), _not_flown("urban", what[1], "reported")]
+        return [not_flown("urban", what[0], "all"), not_flown("urban", what[1], "reported")]
     told, drifts, fine = [], [], True
     for drone in flight.result.drones:
         rows = {row.sequence: row for row in drone.log.frames}
@@ -273,26 +244,5 @@ def _nees_values(flight: PaperFlight, source: str) -> Array:
     return np.concatenate(parts) if parts else np.empty(0)
 
 
-def _rmse_cm(flight: PaperFlight, name: str) -> float | None:
-    scores = flight.drone(name).scores
-    return None if scores is None else 100.0 * scores.ate_m
-
-
-def _at_most(
-    experiment: str, what: str, asked: str, value: float | None, limit: float, form: str
-) -> Goal:
-    if value is None:
-        return Goal(experiment, what, asked, "never localized", "not met")
-    return Goal(experiment, what, asked, form.format(value), "met" if value <= limit else "not met")
-
-
-def _not_flown(experiment: str, what: str, asked: str) -> Goal:
-    return Goal(experiment, what, asked, "not flown", "not judged")
-
-
 def _norm(errors: AxisErrors) -> float:
     return float(np.linalg.norm(errors.fused_cm))
-
-
-def _cm(value: float | None) -> str:
-    return "never localized" if value is None else f"{value:.1f} cm"

@@ -8,10 +8,11 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from sitl import paper_figures, paper_flight_figures
+from sitl.goals import Goal
 from sitl.page_style import document, section
 from sitl.paper_experiments import TABLE_I, AxisErrors, Pipeline
 from sitl.paper_flights import PaperFlight
-from sitl.paper_goals import NEES_MEDIAN, WORSE_AT_MOST, Goal
+from sitl.paper_goals import NEES_MEDIAN, WORSE_AT_MOST
 
 if TYPE_CHECKING:
     from sitl.paper import PaperResult
@@ -84,22 +85,20 @@ def _alarms(result: PaperResult) -> str:
 
 
 def _must_show(result: PaperResult, pipelines: Sequence[Pipeline]) -> str:
-    heads = "<th class=text>measured</th><th class=text></th>" * len(pipelines)
-    if len(pipelines) > 1:
-        heads = "".join(
-            f"<th class=text>{escape(p.title)}</th><th class=text></th>" for p in pipelines
+    """Return a table a pipeline: what one has to show another may not."""
+    parts = []
+    for pipeline in pipelines:
+        rows = "".join(
+            f"<tr><td>{escape(g.experiment or 'all')}</td><td class=text>{escape(g.what)}</td>"
+            f"<td class=text>{escape(g.goal)}</td><td class=text>{escape(g.measured)}</td>"
+            f"{_verdict(g)}</tr>"
+            for g in result.goals[pipeline.name]
         )
-    rows = []
-    for goals in zip(*(result.goals[p.name] for p in pipelines), strict=True):
-        first = goals[0]
-        cells = "".join(f"<td class=text>{escape(g.measured)}</td>{_verdict(g)}" for g in goals)
-        rows.append(
-            f"<tr><td>{escape(first.experiment or 'all')}</td><td class=text>{escape(first.what)}"
-            f"</td><td class=text>{escape(first.goal)}</td>{cells}</tr>"
-        )
-    head = "<tr><th>flight</th><th class=text>shows</th><th class=text>goal</th>" + heads + "</tr>"
-    table = f"<div class=scroll><table>{head}{''.join(rows)}</table></div>"
-    return section("What it must show", _GOALS_NOTE, table)
+        heads = "".join(f"<th class=text>{h}</th>" for h in ("shows", "goal", "measured", ""))
+        table = f"<div class=scroll><table><tr><th>flight</th>{heads}</tr>{rows}</table></div>"
+        of = f", {escape(pipeline.title)}" if len(pipelines) > 1 else ""
+        parts.append(section(f"What it must show{of}", _GOALS_NOTE, table))
+    return "".join(parts)
 
 
 def _verdict(goal: Goal) -> str:

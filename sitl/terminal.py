@@ -15,7 +15,7 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from sitl.fly import Progress
-from sitl.paper_goals import Goal
+from sitl.goals import Goal
 
 
 @contextmanager

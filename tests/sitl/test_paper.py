@@ -20,6 +20,7 @@ from click.testing import CliRunner
 from sitl import paper_fingerprint
 from sitl.__main__ import main
 from sitl.evaluation import upper_from_covariance
+from sitl.goals import Goal
 from sitl.paper import PaperResult, paper_json
 from sitl.paper_estimates import by_source
 from sitl.paper_experiments import (
@@ -35,7 +36,7 @@ from sitl.paper_experiments import (
 from sitl.paper_figures import rotate_svg, sparse_svg
 from sitl.paper_flight_figures import axis_errors_svg, footprints, trajectories_svg, urban_svg
 from sitl.paper_flights import PaperFlight, flown
-from sitl.paper_goals import Goal, goals
+from sitl.paper_goals import goals
 from sitl.paper_measures import compared, flight_measures, path_length_m
 from sitl.paper_page import page
 from sitl.paper_recordings import Rendered, rendered
