@@ -16,8 +16,10 @@ _FOLDER = click.Path(path_type=Path)
 _PIPELINES = ("default", "paper")
 
 
-def _speed(_: click.Context, param: click.Parameter, value: str) -> float:
-    """Return ``max`` as infinity, else a positive number."""
+def _speed(_: click.Context, param: click.Parameter, value: str | None) -> float | None:
+    """Return ``max`` as infinity, else a positive number; None when it was not given."""
+    if value is None:
+        return None
     try:
         speed = math.inf if value == "max" else float(value)
     except ValueError:
@@ -164,15 +166,15 @@ def render(scenario: str, out: Path) -> None:
     "--only",
     multiple=True,
     metavar="NAME",
-    help="rotate, sparse, forward_back, forward_back_near or urban (repeatable); otherwise all.",
+    help="rotate, sparse, forward_back, forward_back_near, forward_back_noisy or urban "
+    "(repeatable); otherwise all.",
 )
 @click.option(
     "--speed",
-    default="max",
-    show_default=True,
     metavar="X|max",
     callback=_speed,
-    help="Seconds of the recording per second, or max: as fast as all daemons keep up.",
+    help="Seconds of the recording per second, or max: as fast as all daemons keep up; "
+    "otherwise the paper's pipeline at max, the default one in real time.",
 )
 @click.option(
     "--recordings",
@@ -210,7 +212,7 @@ def render(scenario: str, out: Path) -> None:
 def paper(
     out: Path,
     only: tuple[str, ...],
-    speed: float,
+    speed: float | None,
     recordings: Path | None,
     seconds: float | None,
     start_timeout: float,

@@ -53,7 +53,8 @@ class PaperOptions:
 
     Attributes:
         only: names of experiments; empty: all.
-        speed: recording seconds per wall second; infinite: as fast as all daemons keep up.
+        speed: recording seconds per wall second; infinite: as fast as all daemons keep up;
+            None: each pipeline's own.
         settings: more of the daemons' configuration, for every flight.
         seconds: only so much of each scenario is rendered and flown; None: all of it.
         recordings: where rendered scenarios are kept; None: in the output folder.
@@ -61,7 +62,7 @@ class PaperOptions:
     """
 
     only: tuple[str, ...] = ()
-    speed: float = math.inf
+    speed: float | None = None
     settings: tuple[Setting, ...] = ()
     seconds: float | None = None
     recordings: Path | None = None
@@ -165,7 +166,7 @@ def _fly(
     folder = out / "flights" / _label(experiment, options)
     folder = folder / f"{pipeline.name}-{variant_name(fused)}"
     fly_options = FlyOptions(
-        speed=options.speed,
+        speed=options.speed or pipeline.speed,
         start_timeout_s=options.start_timeout_s,
         settings=settings_of(experiment, pipeline, fused, options.settings),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from sitl.plan import Setting, pipeline_setting
@@ -26,11 +27,14 @@ class Pipeline:
     Attributes:
         name: key in ``paper.json`` and folder of its flights.
         title: for people.
+        speed: recording seconds per wall second that it is flown at; infinite: as fast as
+            all daemons keep up, where they do not in real time.
         settings: what makes a daemon localize like this.
     """
 
     name: str
     title: str
+    speed: float
     settings: tuple[Setting, ...] = ()
 
 
@@ -60,8 +64,8 @@ class Experiment:
 
 
 PIPELINES = (
-    Pipeline("default", "the default pipeline"),
-    Pipeline("paper", "the paper's pipeline", (pipeline_setting("paper"),)),
+    Pipeline("default", "the default pipeline", 1.0),
+    Pipeline("paper", "the paper's pipeline", math.inf, (pipeline_setting("paper"),)),
 )
 
 _EVERY_IMAGE = Tuned(
@@ -96,6 +100,14 @@ EXPERIMENTS = (
         "3, harder: the same from 12 to 42 m",
         "forward_back_near",
         ("mav1", "mav2"),
+        tuned=(_EVERY_TENTH,),
+    ),
+    Experiment(
+        "forward_back_noisy",
+        "3, as a poor camera sees it: noise of 6 grey levels, blur of 1 px",
+        "forward_back_noisy",
+        ("mav1", "mav2"),
+        compared=False,
         tuned=(_EVERY_TENTH,),
     ),
     Experiment(

@@ -234,7 +234,8 @@ def test_an_unfused_flight_stays_unfused_whatever_is_given() -> None:
     assert settings_of(rotate, PIPELINE, True, ())[-1].value == 1
     assert settings_of(rotate, PIPELINE, True, given)[-2:] == given
     assert settings_of(rotate, PIPELINE, False, given)[-1] == NOT_FUSED
-    assert [e.variants() for e in EXPERIMENTS] == [(True, False)] * 4 + [(True,)]
+    once = {e.name for e in EXPERIMENTS if e.variants() == (True,)}
+    assert once == {"forward_back_noisy", "urban"}
 
 
 class _Balanced(HTMLParser):
@@ -263,7 +264,7 @@ def test_the_page_has_table_one_with_a_column_for_each_pipeline(tmp_path: Path) 
         for fused in EXPERIMENT[name].variants()
     }
     of_other = {key: flight for key, flight in flights.items() if key[0] == "forward_back"}
-    other = Pipeline("other", "another <pipeline>")
+    other = Pipeline("other", "another <pipeline>", 1.0)
     scenarios = {name: load_scenario(name) for name in EXPERIMENT}
     result = PaperResult(EXPERIMENTS, scenarios)
     for pipeline, its in ((PIPELINE, flights), (other, of_other)):
