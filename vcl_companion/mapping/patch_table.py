@@ -12,13 +12,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.drone_view import decode_image
 from vcl_companion.mapping.known_features import Index
+from vcl_companion.mapping.surfaces import slopes_of
 from vcl_companion.vision.patches import (
     AlignRules,
     Anchors,
@@ -28,13 +28,9 @@ from vcl_companion.vision.patches import (
     lens_of,
     pyramid_of,
 )
-from vcl_companion.vision.surface_kernels import inclinations
 
 PyramidOf = Callable[[bytes, Camera], Pyramid]
 
-_N_NEIGHBOURS = 12
-_NEIGHBOURHOOD_PX = 40.0
-_INCLINATION = 1.0
 _MARGIN_PX = 7.0
 _LEAST_COSINE = np.cos(np.deg2rad(60.0))
 # Not magnified more than, nor shrunk more than.
@@ -162,17 +158,8 @@ class PatchTable:
             if self._pyramids[i] is None or not ok.any():
                 continue
             rows, pixels, ideal, r = rows[ok], pixels[ok], ideal[ok], 1.0 / z[ok]
-            near = min(_N_NEIGHBOURS, len(rows))
-            distance, other = cKDTree(pixels).query(pixels, near)
-            slopes = inclinations(
-                np.ascontiguousarray(ideal),
-                r,
-                np.maximum(reference.sigma[rows], 1e-4) * r,
-                np.asarray(other, dtype=np.int64).reshape(len(rows), -1),
-                np.asarray(distance, dtype=np.float64).reshape(len(rows), -1),
-                _NEIGHBOURHOOD_PX,
-                _INCLINATION,
-            )
+            sigma = np.maximum(reference.sigma[rows], 1e-4) * r
+            slopes = slopes_of(pixels, ideal, r, sigma)
             inverse = np.linalg.inv(camera.pixel_slopes(ideal)).reshape(-1, 4)
             planes[rows] = np.column_stack([ideal, r, slopes, inverse])
             fit[rows] = True

@@ -28,7 +28,7 @@ _SINGULAR = 1e-11
 # little of it: it acts on keyframes like so much more independent noise. NEES of keyframes
 # after several extensions, 6 degrees of freedom: 0.6 to 16 on rendered flights (median 5),
 # up to 60 on photographs: still too sure there.
-SHARED_NOISE_PX = 0.4
+SHARED_NOISE_PX = 0.5
 # No distance between drones is known better; much smaller sigmas overflow.
 _FINEST_M = 1e-6
 
