@@ -52,7 +52,7 @@ class LocalizationOptions:
     """
 
     detector: Detector = "akaze"
-    fallback_detector: Detector | Literal[""] = "sift"
+    fallback_detector: Literal["akaze", "sift", "orb", ""] = "sift"
     min_inliers: int = 15
     guided_radius_px: float = 40.0
     noise_floor_px: float = 0.4

@@ -18,6 +18,8 @@ Ints = NDArray[np.int64]
 
 _MIN_DEPTH_M = 1e-3
 CONVERGED, SINGULAR, DIVERGED = 0, 1, 2
+# What is left of a diagonal element when the others are known; less is rounding.
+_LEAST_PIVOT = 1e-12
 
 
 @compiled
@@ -53,7 +55,7 @@ def converged(
     residual, j_pose, j_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
     weighted = np.empty((2, 6))
     information = np.empty(3)
-    normal, rhs = np.empty((6, 6)), np.empty(6)
+    normal, rhs, step = np.empty((6, 6)), np.empty(6), np.empty(6)
     for k in range(len(scales)):
         scale = scales[k]
         for _ in range(4):
@@ -81,13 +83,8 @@ def converged(
                             weighted[0, c] * j_pose[0, d] + weighted[1, c] * j_pose[1, d]
                         )
                     rhs[c] -= weighted[0, c] * residual[0] + weighted[1, c] * residual[1]
-            for c in range(6):
-                for d in range(c):
-                    normal[d, c] = normal[c, d]
-            for c in range(6):
-                if not (normal[c, c] > 0.0 and math.isfinite(rhs[c])):
-                    return now, SINGULAR
-            step = np.asarray(np.linalg.solve(normal, rhs), dtype=np.float64)
+            if not _solved(normal, rhs, step):
+                return now, SINGULAR
             length = math.sqrt(float((step * step).sum()))
             if not length < 1e3:
                 return now, DIVERGED
@@ -95,6 +92,35 @@ def converged(
             if length < (1e-4 if scale > 1.0 else 1e-7):
                 break
     return now, CONVERGED
+
+
+@compiled
+def _solved(normal: Array, rhs: Array, step: Array) -> bool:
+    """Solve a (6, 6) normal matrix by Cholesky; False where it is singular or not finite.
+
+    The matrix is overwritten. Pivots are judged against the diagonal, whatever its units.
+    """
+    for c in range(6):
+        own = normal[c, c]
+        for k in range(c):
+            normal[c, c] -= normal[c, k] * normal[c, k]
+        if not (own > 0.0 and normal[c, c] > _LEAST_PIVOT * own and math.isfinite(rhs[c])):
+            return False
+        normal[c, c] = math.sqrt(normal[c, c])
+        for r in range(c + 1, 6):
+            for k in range(c):
+                normal[r, c] -= normal[r, k] * normal[c, k]
+            normal[r, c] /= normal[c, c]
+    for c in range(6):
+        step[c] = rhs[c]
+        for k in range(c):
+            step[c] -= normal[c, k] * step[k]
+        step[c] /= normal[c, c]
+    for c in range(5, -1, -1):
+        for k in range(c + 1, 6):
+            step[c] -= normal[k, c] * step[k]
+        step[c] /= normal[c, c]
+    return True
 
 
 @compiled
