@@ -88,7 +88,7 @@ def refinement(inputs: Inputs) -> list[Entry]:
         moved, _ = problem.refined(model, 2.5 * _NOISE_PX)
         return Pose(moved[:, :3], moved[:, 3] - moved[:, :3] @ centre)
 
-    def by_scipy(loss: Literal["linear", "cauchy"]) -> Pose:
+    def by_scipy(loss: Literal["linear", "soft_l1"]) -> Pose:
         result = least_squares(
             _reprojection, _vector(start), _reprojection_slopes, loss=loss, f_scale=2 * _NOISE_PX,
             x_scale="jac", args=(points, seen, camera.focal_px),
@@ -108,7 +108,7 @@ def refinement(inputs: Inputs) -> list[Entry]:
         Entry("ours, with covariance", with_covariance, judge),
         Entry("ours, likeliest", likeliest, judge),
         Entry("scipy least_squares", partial(by_scipy, "linear"), judge),
-        Entry("scipy least_squares, cauchy", partial(by_scipy, "cauchy"), judge),
+        Entry("scipy least_squares, soft L1", partial(by_scipy, "soft_l1"), judge),
         Entry("cv2 solvePnPRefineLM", by_cv2, judge),
     ]
 
