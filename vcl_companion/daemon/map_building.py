@@ -73,6 +73,7 @@ def update_map(
         memory.features,
         map_options,
         pyramid_of=memory.pyramid,
+        sure=stored.index.uncertainty,
     )
 
 

@@ -11,7 +11,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.leverage import leverages
 from vcl_companion.mapping.options import MapOptions
-from vcl_companion.vision.bundle import Views, normal_equations, reprojection_residuals
+from vcl_companion.vision.bundle import Views, point_information, reprojection_residuals
 from vcl_companion.vision.hartley_sturm import triangulate_optimal
 from vcl_companion.vision.triangulation import ray_angles, triangulate
 
@@ -76,11 +76,9 @@ def depth_errors(views: Views) -> Array:
     Args:
         views: an estimate; the distance is that to the nearest view that sees the landmark.
     """
-    system = normal_equations(views, None)
-    diagonal = np.arange(3)
-    system.point_block[:, diagonal, diagonal] += 1e-12
-    covariance = np.linalg.inv(system.point_block) * _NOISE_PX**2
-    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0))
+    # The least known direction has the smallest eigenvalue.
+    least = np.linalg.eigvalsh(point_information(views) + 1e-12 * np.eye(3))[:, 0]
+    sigma = _NOISE_PX / np.sqrt(np.maximum(least, 1e-12))
     return np.asarray(sigma / nearest_m(views))
 
 

@@ -9,7 +9,6 @@ average out over landmarks or frames and is what fusing must not forget.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,10 +24,10 @@ from vcl_companion.vision.schur import eliminated
 # landmarks of little parallax leaves 1e-12 by rounding.
 _SINGULAR = 1e-11
 # What displaces a feature or a patch is alike in neighbouring ones, so that residuals tell too
-# little of it: it acts on keyframes like so much more independent noise. NEES of keyframes
-# after several extensions, 6 degrees of freedom: 0.6 to 16 on rendered flights (median 5),
-# up to 60 on photographs: still too sure there.
-SHARED_NOISE_PX = 0.5
+# little of it: it acts on keyframes like so much more independent noise. And from one extension
+# of a map to the next it does not change its sign: what an extension adds to the error grows with
+# how many there were before. NEES of keyframes rose so on rendered flights and on photographs.
+SHARED_NOISE_PX = 0.28
 # No distance between drones is known better; much smaller sigmas overflow.
 _FINEST_M = 1e-6
 
@@ -85,7 +84,7 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
     with np.errstate(all="ignore"):
         views = views_of(landmark_map)
         # Distances enter in units of their own sigma; pixels in px: bring both to sigmas.
-        noise_px = math.hypot(landmark_map.pixel_noise_px, SHARED_NOISE_PX)
+        noise_px = _noise_px(landmark_map)[:, None, None]
         scaled = replace(views, slopes=views.slopes / noise_px)
         system = normal_equations(scaled, None)
         inverse = _inverse(system.point_block)
@@ -95,6 +94,14 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
         covariance = np.zeros_like(reduced)
         covariance[6:, 6:] = _inverse(reduced[6:, 6:])
     return MapUncertainty(covariance, inverse, lever)
+
+
+def _noise_px(landmark_map: LandmarkMap) -> Array:
+    """Return (V,) noise of the observations in each keyframe, px, 1 sigma."""
+    times = [k.captured_at_ns for k in landmark_map.keyframes]
+    generation = np.searchsorted(np.unique(times), times)
+    shared_px = SHARED_NOISE_PX * np.sqrt(1.0 + 3.0 * generation)
+    return np.asarray(np.hypot(landmark_map.pixel_noise_px, shared_px))
 
 
 def _inverse(information: Array) -> Array:

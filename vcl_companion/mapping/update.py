@@ -75,8 +75,9 @@ def extended(
     options: MapOptions,
     seed: int = 0,
     pyramid_of: PyramidOf = decoded_pyramid,
+    sure: MapUncertainty | None = None,
 ) -> LandmarkMap | NoMap:
-    """Do what ``extend_map`` does, with any source of features and images.
+    """Do what ``extend_map`` does, with any source of features, images and uncertainty.
 
     Views that say where they are are joined by patches. Those that do not, or are not
     there, are registered by their features, on what the others have made of the map.
@@ -86,7 +87,7 @@ def extended(
     if not views:
         return NoMap("there is no view that the map does not have already")
     try:
-        sure = map_uncertainty(old)
+        sure = sure or map_uncertainty(old)
         growth = _grown(old, sure, views, features_of, options, seed, pyramid_of)
     except ValueError as error:
         return NoMap(str(error))

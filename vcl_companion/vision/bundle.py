@@ -134,6 +134,11 @@ def adjust(views: Views, options: BundleOptions) -> tuple[Views, float]:
     return views, residual_noise_px(reprojection_residuals(views))
 
 
+def point_information(views: Views) -> Array:
+    """Return (N, 3, 3) information on each landmark were the poses exact, for 1 px of noise."""
+    return kernels.point_blocks(*_Problem(views, 1.0).arguments(views))
+
+
 @dataclass(frozen=True, eq=False)
 class _System:
     """The reduced system at one estimate, and what leads from poses to landmarks."""
@@ -162,11 +167,11 @@ class _Problem:
     def cost(self, views: Views) -> float:
         """Return the robust cost, px^2 (distances weighted to the same unit)."""
         by_distance = sum(_add_distance(views, d, None, None) for d in views.distances)
-        return by_distance + kernels.cost_of(*self._arguments(views), self._cauchy_px)
+        return by_distance + kernels.cost_of(*self.arguments(views), self._cauchy_px)
 
     def system(self, views: Views, damping: float) -> _System:
         """Linearise at an estimate."""
-        system = _System(*kernels.reduced(*self._arguments(views), self._cauchy_px, damping))
+        system = _System(*kernels.reduced(*self.arguments(views), self._cauchy_px, damping))
         before = np.diag(system.normal).copy()
         for known in views.distances:
             _add_distance(views, known, system.normal, system.rhs)
@@ -188,9 +193,10 @@ class _Problem:
             return None
         return pose_step, point_step
 
-    def _arguments(
+    def arguments(
         self, views: Views
     ) -> tuple[Array, Array, Array, kernels.Ints, kernels.Ints, Array, Array]:
+        """Return an estimate as the compiled loops take it."""
         points = np.ascontiguousarray(views.points)
         bodies = _matrices(views.bodies)
         return (

@@ -96,6 +96,31 @@ def cost_of(
 
 
 @compiled
+def point_blocks(
+    points: Array,
+    bodies: Array,
+    mountings: Array,
+    first: Ints,
+    view: Ints,
+    slopes: Array,
+    ideal: Array,
+) -> Array:
+    """Return (N, 3, 3) normal matrices of the landmarks, 1/m^2 per px^2, the poses being exact."""
+    residual, j_pose, j_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
+    blocks = np.zeros((len(points), 3, 3))
+    for j in range(len(points)):
+        for m in range(first[j], first[j + 1]):
+            i = view[m]
+            _linearized(
+                points[j], bodies[i], mountings[i], slopes[m], ideal[m], residual, j_pose, j_point
+            )
+            for r in range(3):
+                for c in range(3):
+                    blocks[j, r, c] += j_point[0, r] * j_point[0, c] + j_point[1, r] * j_point[1, c]
+    return blocks
+
+
+@compiled
 def reduced(
     points: Array,
     bodies: Array,
