@@ -10,7 +10,7 @@ from concurrent.futures import Executor
 
 from vcl_companion.cameras.source import CameraSource, Frame
 from vcl_companion.daemon.estimator import Estimator
-from vcl_companion.daemon.flight_log import FlightLog, PoseSource
+from vcl_companion.daemon.flight_log import Basis, FlightLog, PoseSource
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.inter_target import Asked, InterTarget
@@ -18,7 +18,7 @@ from vcl_companion.daemon.mailbox import Mailbox
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot import AutopilotLink
-from vcl_companion.localization.intra import Localized, NotLocalized, Recognised
+from vcl_companion.localization.intra import Localized, NotLocalized
 from vcl_companion.localization.pipeline import PipelineOptions, localize
 from vcl_companion.localization.pose_filter import FilterState, NotFused
 from vcl_companion.recording.sensor import Sensor
@@ -79,6 +79,7 @@ class Companion:
         self._options = options
         self._mailbox = Mailbox()
         self._over = asyncio.Event()
+        self._sent_at_ns = -1
 
     async def read_camera(self) -> None:
         """Move frames from the camera to the mailbox until the stream ends and all are answered.
@@ -160,7 +161,7 @@ class Companion:
         if refused is None:
             self._outcomes.close(frame)
         else:
-            self._outcomes.refuse(frame, refused)
+            self._give_up(frame, refused)
         return None
 
     def _take(
@@ -184,7 +185,7 @@ class Companion:
         )
         if isinstance(state, NotLocalized):
             return state
-        return self._send(frame, state, "intra", fix.n_matched, fix.n_inliers, fix.by)
+        return self._send(frame, state, "intra", fix.by, fix.n_matched, fix.n_inliers)
 
     async def _hear_peers(
         self, asked: Asked, stored: StoredMap, refused: NotLocalized | None
@@ -196,9 +197,9 @@ class Companion:
         if refused is None:
             self._outcomes.close(asked.frame, None if state is None else "fused")
         elif state is None:
-            self._outcomes.refuse(asked.frame, refused)
+            self._give_up(asked.frame, refused)
         else:
-            unsent = self._send(asked.frame, state, "inter")
+            unsent = self._send(asked.frame, state, "inter", "peer")
             if unsent is None:
                 self._outcomes.close(asked.frame)
             else:
@@ -224,9 +225,9 @@ class Companion:
         frame: Frame,
         state: FilterState,
         source: PoseSource,
+        by: Basis,
         n_matched: int = 0,
         n_inliers: int = 0,
-        by: Recognised | None = None,
     ) -> NotLocalized | None:
         """Send the pose of a frame, at its own time; or say why it cannot be."""
         sent = self._autopilot.send_pose(
@@ -237,8 +238,24 @@ class Companion:
         )
         if not sent:
             return NotLocalized("the pose's covariance is not finite", n_matched, n_inliers)
-        self._outcomes.sent(frame, source, n_matched, n_inliers, by)
+        self._sent_at_ns = max(self._sent_at_ns, frame.captured_at_ns)
+        self._outcomes.sent(frame, source, by, n_matched, n_inliers)
         return None
+
+    def _give_up(self, frame: Frame, why: NotLocalized) -> None:
+        """Refuse a frame; while the last fix is fresh, attitude and motion still say where it is.
+
+        Not when the autopilot has heard of a later frame: a pose of the past that
+        nobody has measured is no news.
+        """
+        at_ns = frame.captured_at_ns
+        state = self._estimator.coasted_at(at_ns) if at_ns > self._sent_at_ns else None
+        coasted = state is not None and self._autopilot.send_pose(
+            state.world_from_body, state.pose_covariance(), at_ns, self._estimator.n_resets
+        )
+        if coasted:
+            self._sent_at_ns = at_ns
+        self._outcomes.refuse(frame, why, coasted=coasted)
 
     def _drop(self, frame: Frame) -> None:
         """Answer a frame whose place a newer one took before it was looked at."""
