@@ -16,7 +16,7 @@ from vcl_companion.geometry.rotation import Array, exp_so3
 from vcl_companion.mapping.drone_view import encode_image
 from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
 from vcl_companion.recording.sensor import BODY_FROM_CAM_FORWARD
-from vcl_companion.vision.features import Image
+from vcl_companion.vision.features import FeatureOptions, Image, detect
 
 MOUNTING = Pose(BODY_FROM_CAM_FORWARD @ exp_so3(np.array([0.01, 0.02, 0.0])), np.array([0.1, 0, 0]))
 # Three drones side by side, as at the start of a flight.
@@ -81,15 +81,20 @@ def painted_map(
     n: int = 500,
     noise_px: float = 0.25,
     bodies: tuple[Pose, ...] = BODIES,
+    recognisable: bool = False,
 ) -> LandmarkMap:
     """Return the map of places that are visible from all of its keyframes.
 
-    Poses are true; a landmark lies on the truth up to its depth, which is as wrong
-    as ``noise_px`` in the keyframes leave it.
+    With ``recognisable`` they are what a detector finds in the first one. Poses are
+    true; a landmark lies on the truth up to its depth, which is as wrong as
+    ``noise_px`` in the keyframes leave it.
     """
     cams = [body @ MOUNTING for body in bodies]
     size = np.array([camera.width_px, camera.height_px])
     found = rng.uniform(20.0, size - 21.0, (8 * n, 2))
+    if recognisable:
+        found = detect(photograph(bodies[0], None, camera), "akaze", FeatureOptions()).pixels
+        found = rng.permutation(found)
     rays = np.column_stack([camera.ideal_from_pixels(found), np.ones(len(found))])
     hits = world().intersect(cams[0].translation, rays @ cams[0].rotation.T)
     points = hits.points_world[np.isfinite(hits.distance)]
