@@ -21,6 +21,7 @@ from vcl_companion.localization.intra import (
 from vcl_companion.localization.pipeline import PipelineOptions, localize
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.vision.features import Features, Image
+from vcl_companion.vision.hamming import hamming_index
 
 DRONE, FRAME = 2, 4
 OPTIONS = PipelineOptions(demo.FEATURES, LocalizationOptions(), TrackingOptions())
@@ -38,8 +39,9 @@ def answered(
     """A frame of the demo against the map of the drones' first frames."""
     index, sensor = demo.map_index(1, 2, 3), demo.sensor(DRONE)
     if not recognisable:
-        blank = np.zeros_like(index.entries.descriptors)
-        index = replace(index, entries=Features(index.entries.pixels, blank))
+        blank = np.zeros(index.entries.descriptors.shape, np.uint8)
+        entries = Features(index.entries.pixels, blank)
+        index = replace(index, entries=entries, search=hamming_index(blank, index.owner))
     shot = demo.shot(DRONE, FRAME)
     return localize(
         shot.image if image is None else image, sensor.camera, sensor.body_from_cam,
