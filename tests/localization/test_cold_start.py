@@ -10,12 +10,14 @@ import pytest
 
 from tests.checks import assert_pose_close, nees
 from tests.localization.maps import index_of, seen_from
-from tests.localization.painted import MOUNTING, Scenery, painted_map, photograph
+from tests.localization.painted import BODIES, MOUNTING, Scenery, painted_map, photograph
 from tests.mapping.views import descriptors_of, map_of
 from tests.scenes import PINHOLE, facade_scene
 from vcl_companion.daemon.estimator import Estimator
+from vcl_companion.daemon.feature_memory import FeatureMemory
+from vcl_companion.daemon.map_building import build_map
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import exp_so3, matrix_from_euler
+from vcl_companion.geometry.rotation import exp_so3, matrix_from_euler, quaternion_from_matrix
 from vcl_companion.localization.intra import (
     LocalizationOptions,
     Localized,
@@ -26,9 +28,12 @@ from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.localization.pipeline import PipelineOptions, localize
 from vcl_companion.localization.pose_filter import FilterOptions, FilterState
 from vcl_companion.localization.tracking import TrackingOptions
+from vcl_companion.mapping.drone_view import encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.vision.features import FeatureOptions
+from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.map_codec import decode_map, encode_map
 
 OPTIONS = PipelineOptions(FeatureOptions(), LocalizationOptions(), TrackingOptions())
@@ -73,6 +78,33 @@ def test_the_first_image_is_enough(scenery: Scenery, place: str, north: bool) ->
     estimator = Estimator(FilterOptions(), OPTIONS.localization, lambda _: None)
     assert isinstance(estimator.take_fix(None, fix, 0, attitude), FilterState)
     assert estimator.is_localized(0)
+
+
+def test_a_flat_wall_s_map_that_the_drones_make_themselves() -> None:
+    """Three views of nothing but a plane: gravity and the third view settle the two solutions."""
+    rng = np.random.default_rng(0)
+    answers = []
+    for i, body in enumerate(BODIES):
+        noise = exp_so3((i > 0) * np.deg2rad(0.5) * rng.standard_normal(3))
+        image = encode_image(photograph(body, rng, scenery="wall"), 80)
+        attitude = quaternion_from_matrix(body.rotation @ noise)
+        answers.append(FrameAnswer(i + 1, 1, 0, 0.0, attitude, MOUNTING, PINHOLE, image))
+    apart_m = float(np.linalg.norm(BODIES[1].translation))
+    memory, options = FeatureMemory(OPTIONS.features), MapOptions(detectors=("akaze",))
+    made = build_map(answers, 1, ((1, 2, apart_m),), options, memory)
+    assert isinstance(made, LandmarkMap), made
+    for keyframe, body in zip(made.keyframes, BODIES, strict=True):
+        assert_pose_close(keyframe.world_from_body, body, within_m=0.01, within_rad=1e-3)
+    index = index_map(made, "akaze", OPTIONS.features)
+    templates = prepare_templates(made, index.uncertainty)
+    for place in (PLACES["as then"], Pose(exp_so3(np.array([0, 0, 0.5])), np.array([1.0, -5, 0]))):
+        image_now = photograph(place, rng, scenery="wall")
+        for attitude_now in (place.rotation, None):
+            fix = localize(
+                image_now, PINHOLE, MOUNTING, index, templates, None, attitude_now, OPTIONS
+            )
+            assert isinstance(fix, Localized), fix.reason
+            assert_pose_close(fix.world_from_body, place, within_m=0.02, within_rad=1e-3)
 
 
 @pytest.mark.parametrize("pitch", [False, True], ids=["aslant", "from above"])
