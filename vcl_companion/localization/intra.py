@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -125,11 +125,19 @@ class Localized:
 
 @dataclass(frozen=True)
 class NotLocalized:
-    """No pose from this image, and why."""
+    """No pose from this image, and why.
+
+    Attributes:
+        reason: for people.
+        n_matched: landmarks matched.
+        n_inliers: of these, how many agreed.
+        vague: a pose that was found, too uncertain to be sent, good enough to look from.
+    """
 
     reason: str
     n_matched: int = 0
     n_inliers: int = 0
+    vague: Prior | None = field(default=None, compare=False)
 
 
 def believed(
@@ -146,6 +154,7 @@ def believed(
             f"too uncertain: {sigma:.1f} m, {options.max_sigma_m:.1f} m allowed",
             n_matched,
             n_inliers,
+            Prior(fix.world_from_body, covariance),
         )
     if ned_from_body is not None:
         reason = disagreement(fix.world_from_body.rotation, ned_from_body, options)

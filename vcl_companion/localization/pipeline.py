@@ -4,7 +4,8 @@ Two pipelines. The paper's looks for features in every frame and matches them
 against the map. The default follows the map's patches from where the drone is
 expected, and looks for features only when that fails: at the start, when lost,
 when what the patches say is not believed. A pose found by features then leads
-the patches once, so that what is sent is as good as the frame gives.
+the patches once, so that what is sent is as good as the frame gives; one too
+uncertain to be sent may still lead.
 """
 
 from __future__ import annotations
@@ -76,11 +77,14 @@ def localize(
         detect(image, index.detector, options.features),
         camera, body_from_cam, index, prior, ned_from_body, options.localization,
     )  # fmt: skip
-    if templates is None or isinstance(found, NotLocalized):
+    if isinstance(found, Localized):
+        leads: Prior | None = Prior(found.world_from_body, found.covariance())
+    else:
+        leads = found.vague
+    if templates is None or leads is None:
         return found
     closer = track(
-        image, camera, body_from_cam, templates,
-        Prior(found.world_from_body, found.covariance()), ned_from_body,
+        image, camera, body_from_cam, templates, leads, ned_from_body,
         options.tracking, options.localization,
     )  # fmt: skip
     return closer if isinstance(closer, Localized) else found

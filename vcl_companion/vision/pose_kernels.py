@@ -17,6 +17,8 @@ from vcl_companion.vision.compiled import compiled
 Ints = NDArray[np.int64]
 
 _MIN_DEPTH_M = 1e-3
+# What is left of a diagonal's element by elimination, as a share of it, that is no rounding.
+_LEAST_PIVOT = 1e-13
 CONVERGED, SINGULAR, DIVERGED = 0, 1, 2
 
 
@@ -53,7 +55,7 @@ def converged(
     residual, j_pose, j_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
     weighted = np.empty((2, 6))
     information = np.empty(3)
-    normal, rhs = np.empty((6, 6)), np.empty(6)
+    normal, rhs, step = np.empty((6, 6)), np.empty(6), np.empty(6)
     for k in range(len(scales)):
         scale = scales[k]
         for _ in range(4):
@@ -87,7 +89,8 @@ def converged(
             for c in range(6):
                 if not (normal[c, c] > 0.0 and math.isfinite(rhs[c])):
                     return now, SINGULAR
-            step = np.asarray(np.linalg.solve(normal, rhs), dtype=np.float64)
+            if not _solved(normal, rhs, step):
+                return now, SINGULAR
             length = math.sqrt(float((step * step).sum()))
             if not length < 1e3:
                 return now, DIVERGED
@@ -298,6 +301,37 @@ def informed(
     out[0], out[1], out[2] = yy / determinant, -xy / determinant, xx / determinant
     a, b = residual[0], residual[1]
     return float(out[0] * a * a + 2.0 * out[1] * a * b + out[2] * b * b)
+
+
+@compiled
+def _solved(normal: Array, rhs: Array, step: Array) -> bool:
+    """Fill the solution of (6, 6) normal equations by Cholesky; False where there is none.
+
+    LAPACK's solver would raise, in the middle of a frame.
+    """
+    root = np.zeros((6, 6))
+    for c in range(6):
+        left = normal[c, c]
+        for k in range(c):
+            left -= root[c, k] ** 2
+        if not left > _LEAST_PIVOT * normal[c, c]:
+            return False
+        root[c, c] = math.sqrt(left)
+        for d in range(c + 1, 6):
+            below = normal[d, c]
+            for k in range(c):
+                below -= root[d, k] * root[c, k]
+            root[d, c] = below / root[c, c]
+    for c in range(6):
+        step[c] = rhs[c]
+        for k in range(c):
+            step[c] -= root[c, k] * step[k]
+        step[c] /= root[c, c]
+    for c in range(5, -1, -1):
+        for k in range(c + 1, 6):
+            step[c] -= root[k, c] * step[k]
+        step[c] /= root[c, c]
+    return True
 
 
 @compiled
