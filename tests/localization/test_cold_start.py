@@ -82,6 +82,28 @@ def test_the_first_image_is_enough(scenery: Scenery, place: str, north: bool) ->
     assert estimator.is_localized(0)
 
 
+@pytest.mark.parametrize("scenery", ["boards", "windows"])
+def test_from_anywhere_before_the_scene_the_right_place_or_none(scenery: Scenery) -> None:
+    """Where single landmarks decide what features say, the patches settle it.
+
+    With windows all alike too: most patches must be where they should be.
+    """
+    rng = np.random.default_rng(11)
+    index, templates = stored(scenery)
+    found = []
+    for _ in range(12):
+        place = np.array([rng.uniform(-20, 6), rng.uniform(-12, 12), rng.uniform(-4, 1)])
+        yaw = np.arctan2(-0.8 * place[1], 15.0 - place[0]) + rng.uniform(-0.3, 0.3)
+        truth = Pose(exp_so3(np.array([0.0, rng.uniform(-0.1, 0.1), yaw])), place)
+        image = photograph(truth, rng, scenery=scenery)
+        fix = localize(image, PINHOLE, MOUNTING, index, templates, None, None, OPTIONS)
+        found.append(isinstance(fix, Localized))
+        if isinstance(fix, Localized):
+            assert_pose_close(fix.world_from_body, truth, within_m=0.05, within_rad=3e-3)
+            assert nees(truth.local(fix.world_from_body), fix.covariance())[0] < 35.0
+    assert sum(found) >= 8
+
+
 def test_a_flat_wall_s_map_that_the_drones_make_themselves() -> None:
     """Three views of nothing but a plane: gravity and the third view settle the two solutions."""
     rng = np.random.default_rng(0)

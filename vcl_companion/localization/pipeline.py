@@ -5,7 +5,7 @@ against the map. The default follows the map's patches from where the drone is
 expected, and looks for features only when that fails: at the start, when lost,
 when what the patches say is not believed. A pose found by features then leads
 the patches once, so that what is sent is as good as the frame gives; one too
-uncertain to be sent may still lead.
+uncertain to be believed may still lead, if then most patches are where they should be.
 """
 
 from __future__ import annotations
@@ -29,6 +29,10 @@ from vcl_companion.mapping.templates import Templates
 from vcl_companion.vision.features import FeatureOptions, Image, detect
 
 Pipeline = Literal["default", "paper"]
+
+
+# Share of the patches tried that must agree when what led to them was not to be believed.
+_LED_BY_A_VAGUE_POSE = 0.5
 
 
 @dataclass(frozen=True)
@@ -79,12 +83,15 @@ def localize(
     )  # fmt: skip
     if isinstance(found, Localized):
         leads: Prior | None = Prior(found.world_from_body, found.covariance())
+        least = 0.0
     else:
-        leads = found.vague
+        leads, least = found.vague, _LED_BY_A_VAGUE_POSE
     if templates is None or leads is None:
         return found
     closer = track(
         image, camera, body_from_cam, templates, leads, ned_from_body,
         options.tracking, options.localization,
     )  # fmt: skip
-    return closer if isinstance(closer, Localized) else found
+    if isinstance(closer, Localized) and closer.n_inliers >= least * closer.n_matched:
+        return closer
+    return found
