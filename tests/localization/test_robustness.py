@@ -26,6 +26,7 @@ from vcl_companion.localization.intra import (
     localize_intra,
 )
 from vcl_companion.localization.map_index import index_map
+from vcl_companion.localization.pipeline import PipelineOptions, is_doubtful, localize
 from vcl_companion.localization.tracking import TrackingOptions, track
 from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.mapping.uncertainty import map_uncertainty
@@ -183,6 +184,35 @@ def test_a_fifth_of_the_landmarks_wrong_by_one_and_the_same_vector(
         fix = tracked(image, templates, near(rng, TRUTH, times))
         assert_true(fix)
         assert fix.n_inliers < 0.9 * fix.n_matched
+
+
+def test_who_is_where_the_wrong_landmarks_say_finds_out_when_there_is_time_to_doubt(
+    rng: np.random.Generator,
+) -> None:
+    """A wrong fifth of the map confirms a prediction that is wrong like it."""
+    by_m = np.array([0.0, 1.5, 0.0])
+    landmark_map = painted_map(rng, n=800, recognisable=True)
+    right = prepare_templates(landmark_map, map_uncertainty(landmark_map))
+    templates, wrong = displaced(right, by_m, 0.2, rng)
+    points = np.array(landmark_map.points_world)
+    points[np.unique(templates.anchors.landmark[wrong])] += by_m
+    index = index_map(replace(landmark_map, points_world=points), "akaze", FeatureOptions())
+    image, there = photograph(TRUTH, rng), Pose(TRUTH.rotation, TRUTH.translation + by_m)
+    expected, options = near(rng, there), PipelineOptions(FeatureOptions(), BELIEF, OPTIONS)
+
+    def found(prior: Prior, may_doubt: bool) -> Localized:
+        fix = localize(image, PINHOLE, MOUNTING, index, templates, prior, None, options, may_doubt)
+        assert isinstance(fix, Localized), fix.reason
+        return fix
+
+    misled = found(expected, may_doubt=False)
+    assert_pose_close(misled.world_from_body, there, within_m=0.1, within_rad=0.01)
+    assert is_doubtful(misled)
+    assert_true(found(expected, may_doubt=True))
+    # Where most agree there is nothing to ask.
+    sure = found(near(rng, TRUTH), may_doubt=True)
+    assert not is_doubtful(sure)
+    assert_true(sure)
 
 
 def test_a_map_with_a_fifth_wrong_by_one_vector_is_recognised_rightly(

@@ -19,7 +19,7 @@ from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.localization.intra import Localized, NotLocalized
-from vcl_companion.localization.pipeline import PipelineOptions, localize
+from vcl_companion.localization.pipeline import PipelineOptions, is_doubtful, localize
 from vcl_companion.localization.pose_filter import FilterState, NotFused
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.wire.pose_messages import PoseProposal
@@ -30,6 +30,9 @@ _log = logging.getLogger(__name__)
 ATTITUDE_WAIT_S = 0.1
 # How long the last frames of a stream may take.
 _LAST_FRAMES_S = 5.0
+# How often features are asked about a pose that few patches agree on: it takes as long as ten
+# frames.
+_DOUBT_EVERY_NS = 5_000_000_000
 
 
 class Companion:
@@ -80,6 +83,7 @@ class Companion:
         self._mailbox = Mailbox()
         self._over = asyncio.Event()
         self._sent_at_ns = -1
+        self._doubted_at_ns = -_DOUBT_EVERY_NS
 
     async def read_camera(self) -> None:
         """Move frames from the camera to the mailbox until the stream ends and all are answered.
@@ -152,7 +156,10 @@ class Companion:
             predicted.prior() if predicted else None,
             ned_from_body,
             self._options,
+            at_ns - self._doubted_at_ns >= _DOUBT_EVERY_NS,
         )
+        if isinstance(fix, Localized) and is_doubtful(fix):
+            self._doubted_at_ns = at_ns
         refused = self._take(frame, fix, ned_from_body)
         sigma_m = math.inf if refused else self._estimator.sigma_m
         asked = self._inter.begin(frame, ned_from_body, stored.revision, sigma_m)

@@ -31,6 +31,8 @@ from vcl_companion.vision.features import FeatureOptions, Image, detect
 Pipeline = Literal["default", "paper"]
 
 
+# Fewer than this share of the patches tried: they may be the ones that are wrong.
+_DOUBTFUL = 0.3
 # Share of the patches tried that must agree when what led to them was not to be believed.
 _LED_BY_A_VAGUE_POSE = 0.5
 
@@ -53,8 +55,13 @@ def localize(
     prior: Prior | None,
     ned_from_body: Array | None,
     options: PipelineOptions,
+    may_doubt: bool = False,
 ) -> Localized | NotLocalized:
     """Find the drone's pose in the map; one job for one thread, without a lock.
+
+    A prediction that is wrong finds what is wrong of the map, and is confirmed by
+    it. Where few patches agree, the features of the whole map may be asked whether
+    there is a place that more agree on.
 
     Args:
         image: (H, W) grey.
@@ -65,18 +72,22 @@ def localize(
         prior: where the drone is expected, or None.
         ned_from_body: (3, 3) attitude by the autopilot at that instant, or None.
         options: of the steps.
+        may_doubt: whether there is time for that.
 
     Returns:
         The pose with its covariance in parts, or why there is none: what the
         features said, for they were asked last.
     """
+    tracked: Localized | NotLocalized | None = None
     if templates is not None and prior is not None:
         tracked = track(
             image, camera, body_from_cam, templates, prior, ned_from_body,
             options.tracking, options.localization,
         )  # fmt: skip
         if isinstance(tracked, Localized):
-            return tracked
+            if not (may_doubt and is_doubtful(tracked)):
+                return tracked
+            prior = None
     found = localize_intra(
         detect(image, index.detector, options.features),
         camera, body_from_cam, index, prior, ned_from_body, options.localization,
@@ -87,11 +98,19 @@ def localize(
     else:
         leads, least = found.vague, _LED_BY_A_VAGUE_POSE
     if templates is None or leads is None:
-        return found
+        return tracked if isinstance(tracked, Localized) else found
     closer = track(
         image, camera, body_from_cam, templates, leads, ned_from_body,
         options.tracking, options.localization,
     )  # fmt: skip
+    if isinstance(tracked, Localized):
+        more = isinstance(closer, Localized) and closer.n_inliers > tracked.n_inliers
+        return closer if more else tracked
     if isinstance(closer, Localized) and closer.n_inliers >= least * closer.n_matched:
         return closer
     return found
+
+
+def is_doubtful(fix: Localized) -> bool:
+    """Return whether few of the patches that should be seen agree on a pose."""
+    return fix.by == "patches" and fix.n_inliers < _DOUBTFUL * fix.n_matched
