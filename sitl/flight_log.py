@@ -24,8 +24,8 @@ _Row = TypeVar("_Row", bound=msgspec.Struct)
 class FrameRow(msgspec.Struct, frozen=True):
     """What became of one frame, and how long it took from its arrival to that.
 
-    ``latency_ms`` is None for a frame that was never looked at; ``by`` is what its own
-    pose rests on, "patches" or "features".
+    ``latency_ms`` is None for a frame that was never looked at; ``by`` is what the pose
+    sent for it relies on, "patches", "features", "peer" or "motion", None when none was.
     """
 
     sequence: int

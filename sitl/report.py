@@ -2,7 +2,8 @@
 
 Terms beyond ``sitl.evaluation``'s:
 
-* ``localized_share``: frames whose pose reached the autopilot, of all frames.
+* ``localized_share``: frames whose pose reached the autopilot, of all frames; not those
+  by attitude and motion alone, which count as refused (errors are of all that was sent).
 * ``frames_localized``, ``frames_refused``, ``frames_dropped``: what the daemon's
   log says of each frame; ``unaccounted`` is what it says nothing about.
 * ``latency_ms``: from a frame's arrival in the daemon to its outcome, of frames
@@ -13,6 +14,9 @@ Terms beyond ``sitl.evaluation``'s:
   a peer's alone (``inter``), or both (``fused``); ``nees_median`` and ``ate_m`` of
   the frames' own fixes, of the peers' proposals, and of what was sent; how many
   ``proposals`` came and how many of them were ``proposals_fused``.
+* ``relies_on``: share of the frames whose sent pose relies on the map by ``patches`` or by
+  ``features``, on a ``peer`` alone, on attitude and ``motion`` alone, or where ``nothing``
+  was sent.
 * ``peer_bytes_per_s``: sent to the other drones, per second of recording time.
 * ``map``: the leader's last revision; ``revisions`` counts all of them.
 """
@@ -28,6 +32,7 @@ from typing import Any
 import numpy as np
 
 from sitl.plan import pipeline_of
+from sitl.reliance import shares
 from sitl.report_page import page
 from sitl.result import DroneResult, FlightResult
 
@@ -124,6 +129,7 @@ def _drone(drone: DroneResult, duration_s: float) -> dict[str, Any]:
         "within_3_sigma_share": scores.within_3_sigma_share if scores else None,
         "within_3_sigma_or_10cm_share": scores.within_3_sigma_or_10cm_share if scores else None,
         "nees_median": scores.nees_median if scores else None,
+        "relies_on": shares(log.frames),
         "sources": _sources(drone),
         "latency_ms": {"p50": _percentile(looked_at, 50.0), "p99": _percentile(looked_at, 99.0)},
         "first_frame_ms": first[0] if first else None,

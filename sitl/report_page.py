@@ -9,6 +9,7 @@ from typing import Any
 from sitl import report_plots
 from sitl.page_style import document, section
 from sitl.plotting import colour
+from sitl.reliance import RELIANCES, strips_svg
 from sitl.result import FlightResult
 
 _MAX_EVENTS = 200
@@ -43,6 +44,8 @@ def page(result: FlightResult, report: Mapping[str, Any]) -> str:
         _alarms(report),
         section("Where they flew", _flight_note(result), report_plots.trajectories_svg(result)),
         section("How well", _SCORE_NOTE, _score_table(report)),
+        section("What the poses rely on", _RELIANCE_NOTE,
+                 strips_svg(result) + _reliance_table(report)),
         section("Whence the poses", _SOURCE_NOTE, _source_table(report)),
         section("Error along every axis", _ERROR_NOTE, errors) if errors else "",
         section("Tracked landmarks", "", report_plots.landmarks_svg(result)),
@@ -60,6 +63,12 @@ _SCORE_NOTE = (
     "“aligned” after the best rotation and shift of each drone's own track. In 3σ: poses whose "
     "error stays within three of their own sigmas along each axis. NEES: median, 5.3 when the "
     "covariance is honest, more when it promises too much."
+)
+_RELIANCE_NOTE = (
+    "Of each frame: the map, recognised by its patches or, at the start and when lost, by "
+    "features; a peer that told where we were; attitude and motion since the last of these, for "
+    "a short while (such a frame counts as refused); or nothing. A tick: a peer's word was "
+    "fused as well. Share of the frames in the table."
 )
 _SOURCE_NOTE = (
     "Share of the frames whose pose came from the frame's own landmarks (intra), from a peer that "
@@ -131,6 +140,18 @@ def _score_table(report: Mapping[str, Any]) -> str:
     return _drone_table(report, _COLUMNS, ())
 
 
+def _reliance_table(report: Mapping[str, Any]) -> str:
+    heads = [
+        f'{label} % <span class=swatch style="background:{ink}"></span>'
+        for label, ink in RELIANCES.values()
+    ]
+    rows = []
+    for n, (name, drone) in enumerate(report["drones"].items()):
+        said = drone["relies_on"]
+        rows.append(_row(n, name, [_number(said[k], "{:.1f}", 100.0) for k in RELIANCES]))
+    return _table(heads, rows)
+
+
 def _source_table(report: Mapping[str, Any]) -> str:
     heads = [
         *("intra %", "inter %", "fused %", "proposals", "taken"),
@@ -171,7 +192,7 @@ def _row(n: int, drone: str, cells: Sequence[str]) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[str]) -> str:
-    head = "".join(f"<th>{escape(label)}</th>" for label in ["drone", *heads])
+    head = "".join(f"<th>{label}</th>" for label in ["drone", *heads])
     return f"<div class=scroll><table><tr>{head}</tr>{''.join(rows)}</table></div>"
 
 

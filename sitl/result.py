@@ -81,8 +81,21 @@ class DroneResult:
 
     @property
     def n_localized(self) -> int:
-        """Frames whose pose reached the autopilot."""
-        return len(set(self.frame_of[self.frame_of >= 0].tolist()))
+        """Frames whose pose reached the autopilot, but for those that nobody had measured."""
+        return len(self._heard - self._coasted)
+
+    @property
+    def n_coasted(self) -> int:
+        """Frames whose pose reached the autopilot by attitude and motion alone."""
+        return len(self._heard & self._coasted)
+
+    @property
+    def _heard(self) -> set[int]:
+        return set(self.frame_of[self.frame_of >= 0].tolist())
+
+    @property
+    def _coasted(self) -> set[int]:
+        return {frame.sequence for frame in self.log.frames if frame.by == "motion"}
 
     @property
     def unaccounted(self) -> int:
@@ -260,4 +273,7 @@ def _doubts(drone: DroneResult) -> list[Event]:
     logged = drone.log.count("localized")
     if logged != drone.n_localized:
         out.append(f"{logged} frames localized by the log, {drone.n_localized} poses received")
+    coasted = sum(frame.by == "motion" for frame in drone.log.frames)
+    if coasted != drone.n_coasted:
+        out.append(f"{coasted} frames by motion by the log, {drone.n_coasted} poses received")
     return [Event(0.0, drone.name, "harness", text) for text in out]

@@ -36,6 +36,10 @@ class Flier:
         self.drone.autopilot.measure(shot.at_ns, shot.ned_from_body.quaternion())
         self.server.give(self.server.n_given, shot.at_ns, demo.png(shot.image))
 
+    def bases(self) -> list[tuple[int, str | None]]:
+        """Sequence of every frame and what its sent pose relies on, as they were answered."""
+        return [(line["sequence"], line["by"]) for line in self.drone.lines("frame")]
+
     def sources(self) -> list[tuple[int, str, str | None]]:
         """Sequence, outcome and source of every frame, as they were answered."""
         lines = self.drone.lines("frame")

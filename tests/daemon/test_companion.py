@@ -64,6 +64,12 @@ class Flight:
         self.autopilot.measure(shot.at_ns, quaternion_from_matrix(turned))
         self.server.give(k if sequence is None else sequence, shot.at_ns, demo.png(shot.image))
 
+    def give_image(self, k: int, png: bytes) -> None:
+        """Hand out another picture in the place of the k-th."""
+        shot = demo.shot(DRONE, k)
+        self.autopilot.measure(shot.at_ns, shot.ned_from_body.quaternion())
+        self.server.give(k, shot.at_ns, png)
+
     @property
     def is_localized(self) -> bool:
         return self.estimator.is_localized(self.clock.now_ns())
@@ -81,14 +87,18 @@ class Flight:
     def end_stream(self, k: int) -> None:
         self.server.say_end(demo.shot(DRONE, k).at_ns)
 
+    def lines(self) -> list[dict[str, Any]]:
+        """Every line of a frame."""
+        lines: list[dict[str, Any]] = list(map(json.loads, self.path.read_text().splitlines()))
+        return [line for line in lines if line["kind"] == "frame"]
+
     def frames(self) -> list[tuple[int, str, str | None]]:
         """Sequence, outcome and reason of every line of a frame."""
-        lines: list[dict[str, Any]] = list(map(json.loads, self.path.read_text().splitlines()))
-        return [
-            (line["sequence"], line["outcome"], line["reason"])
-            for line in lines
-            if line["kind"] == "frame"
-        ]
+        return [(line["sequence"], line["outcome"], line["reason"]) for line in self.lines()]
+
+    def bases(self) -> list[str | None]:
+        """What the pose sent for each frame relies on."""
+        return [line["by"] for line in self.lines()]
 
 
 def nobody_to_ask(executor: ThreadPoolExecutor, clock: ManualClock) -> InterTarget:
@@ -170,6 +180,7 @@ def test_frames_become_poses_near_the_truth(tmp_path: Path) -> None:
                 assert pose[-1] == 0  # reset_counter
             assert up.is_localized
             assert set(up.server.outcomes.values()) == {"localized"}
+            assert up.bases() == ["patches"] * 3
             assert up.frames() == [(k, "localized", None) for k in range(3)]
             newest = up.history.newest
             assert newest is not None
@@ -339,6 +350,44 @@ def test_a_picture_without_anything_in_it_is_refused_with_a_reason(tmp_path: Pat
     run(scenario())
 
 
+def test_frames_that_show_nothing_are_bridged_by_attitude_and_motion_for_a_while(
+    tmp_path: Path,
+) -> None:
+    """Less and less certain; then nothing is sent, then a fix again."""
+
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            fog, shows = demo.png(demo.blank(DRONE)), [*range(6), 11]
+            for k in range(12):
+                if k in shows:
+                    up.give(k)
+                else:
+                    up.give_image(k, fog)
+                await up.server.answered()
+            outcomes = [outcome for _, outcome, _ in up.frames()]
+            assert outcomes == ["localized"] * 6 + ["refused"] * 5 + ["localized"]
+            bases = up.bases()
+            n_bridged = bases.count("motion")
+            assert bases[6 : 6 + n_bridged] == ["motion"] * n_bridged
+            assert 2 <= n_bridged <= 4
+            assert bases[6 + n_bridged : 11] == [None] * (5 - n_bridged)
+            sigmas = []
+            for k in range(6 + n_bridged):
+                usec, *sent = await up.autopilot.poses.get()
+                assert usec == demo.shot(DRONE, k).at_ns // 1000
+                variances = np.array(sent[6:27])[[0, 6, 11]]
+                off_m = np.array(sent[:3]) - demo.world_from_body(DRONE, k).translation
+                sigmas.append(float(np.sqrt(variances.max())))
+                assert np.all(np.abs(off_m) < 4.0 * np.sqrt(variances))
+            assert np.all(np.diff(sigmas[5:]) > 0.03)
+            assert sigmas[-1] < LocalizationOptions().max_sigma_m
+            assert (await up.autopilot.poses.get())[0] == demo.shot(DRONE, 11).at_ns // 1000
+            assert bases[11] == "patches"
+
+    run(scenario())
+
+
 def test_an_autopilot_that_turns_its_north_is_followed_after_a_few_frames(tmp_path: Path) -> None:
     async def scenario() -> None:
         async with flying(tmp_path) as up:
@@ -351,6 +400,8 @@ def test_an_autopilot_that_turns_its_north_is_followed_after_a_few_frames(tmp_pa
             assert "against the autopilot's attitude" in str(up.frames()[2][2])
             resets = [(await up.autopilot.poses.get())[-1] for _ in range(4)]
             assert resets == [0, 0, 1, 1]
+            # Frames that contradict the state: it is not sent on its own word.
+            assert up.bases() == ["patches"] * 2 + [None] * 4 + ["patches"] * 2
 
     run(scenario())
 

@@ -31,7 +31,7 @@ def fill(log: FlightLog) -> None:
               by="patches")  # fmt: skip
     log.frame(1, 200, "refused", reason="fog", latency_ms=8.0, matched=3)
     log.frame(2, 300, "dropped")
-    log.frame(3, 400, "refused", reason="fog", latency_ms=9.0)
+    log.frame(3, 400, "refused", reason="fog", latency_ms=9.0, by="motion")
     log.missed(2)
 
 
@@ -61,7 +61,7 @@ def test_lines_are_as_specified(tmp_path: Path) -> None:
          "by": None},
         {"kind": "frame", "sequence": 3, "captured_at_ns": 400, "outcome": "refused",
          "reason": "fog", "latency_ms": 9.0, "matched": 0, "inliers": 0, "source": None,
-         "by": None},
+         "by": "motion"},
         {"kind": "event", "at_ns": 42, "event": "lost", "reason": "fog \u2601"},
         {"kind": "map", "at_ns": 42, "revision": "0001020304050607", "parent": "",
          "landmarks": 120, "bytes": 4567, "keyframes": 3},

@@ -129,6 +129,22 @@ def test_the_same_reason_is_said_once_and_another_one_not_too_often(tmp_path: Pa
     run(scenario())
 
 
+def test_who_lives_on_peers_alone_says_so_but_not_at_every_change(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with healthy(tmp_path) as (health, autopilot):
+            health.localized(by_peers=True)
+            for k in range(100):  # in turn, 5 times a second, for 20 s
+                health.localized(by_peers=k % 2 == 0)
+                hurry(0.2)
+            said = [await autopilot.texts.get() for _ in range(4)]
+            assert said[0] == "VCL localized by peers alone"
+            assert set(said[1:]) <= {"VCL localized", "VCL localized by peers alone"}
+            assert await beats(autopilot) == ACTIVE
+            assert autopilot.texts.qsize() <= 1
+
+    run(scenario())
+
+
 def test_the_watchdog_is_fed_only_while_frames_are_answered(
     tmp_path: Path, manager: Manager
 ) -> None:

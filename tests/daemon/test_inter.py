@@ -79,6 +79,8 @@ def test_a_target_that_sees_too_little_gets_its_pose_through_a_host(tmp_path: Pa
                 flier.give(1)
             await two.server.answered()
             assert two.sources()[1:] == [(1, "localized", "inter")]
+            assert two.bases() == [(0, "peer"), (1, "peer")]
+            assert one.bases() == [(0, "patches"), (1, "patches")]
             assert two.drone.estimator.tracked == 0
             assert one.sources() == [(0, "localized", "intra"), (1, "localized", "intra")]
             assert dict(one.drone.exchange.refused) == dict(two.drone.exchange.refused) == {}
@@ -101,6 +103,8 @@ def test_a_localized_drone_asks_now_and_then_and_is_confirmed(tmp_path: Path) ->
                 assert [source for _, _, source in two.sources()] == [
                     "intra", "fused", "intra", "fused",
                 ]  # fmt: skip
+                # A peer's word joins what the sent pose rests on; it is not what it rests on.
+                assert [by for _, by in two.bases()] == ["patches"] * 4
                 hosts = [line["host"] for line in target.lines("estimate")]
                 assert hosts == [None, None, 1, None, None, 1]
 
@@ -187,6 +191,7 @@ def test_what_cannot_be_believed_leaves_the_frame_refused(tmp_path: Path, answer
                 stranger.say(said, 2)
                 await two.server.answered()
                 assert [o for _, o, _ in two.sources()] == ["localized", "refused"]
+                assert two.bases() == [(0, "peer"), (1, None)]  # nobody knows how fast it flies
                 if answer != "refused":
                     line = drone.lines("estimate")[-1]
                     assert line["fused"] is False

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -16,7 +18,7 @@ from vcl_companion.geometry.rotation import Array, exp_so3
 from vcl_companion.mapping.drone_view import encode_image
 from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
 from vcl_companion.recording.sensor import BODY_FROM_CAM_FORWARD
-from vcl_companion.vision.features import Image
+from vcl_companion.vision.features import FeatureOptions, Image, detect
 
 MOUNTING = Pose(BODY_FROM_CAM_FORWARD @ exp_so3(np.array([0.01, 0.02, 0.0])), np.array([0.1, 0, 0]))
 # Three drones side by side, as at the start of a flight.
@@ -38,9 +40,25 @@ def _paint(rng: np.random.Generator, width_m: float, height_m: float) -> Texture
     return Texture.from_image(np.clip(128.0 + 38.0 * total, 0, 255).astype(np.uint8))
 
 
+Scenery = Literal["boards", "windows", "wall"]
+
+
+def _windows(width_m: float, height_m: float, every_m: float) -> Texture:
+    """Return one small picture over and over: nothing tells two of them apart."""
+    side = round(every_m * 50)
+    coarse = np.random.default_rng(9).standard_normal((8, 8)).astype(np.float32)
+    one = 128.0 + 45.0 * cv2.resize(coarse, (side, side), interpolation=cv2.INTER_CUBIC)
+    size = round(width_m * 50), round(height_m * 50)
+    all_of_them = np.tile(one, (size[1] // side + 1, size[0] // side + 1))[: size[1], : size[0]]
+    return Texture.from_image(np.clip(all_of_them, 0, 255).astype(np.uint8))
+
+
 @cache
-def world() -> World:
-    """Return a wall at 16 m, two inclined boards at 8 to 12 m before it, and the ground."""
+def world(scenery: Scenery = "boards") -> World:
+    """Return a wall at 16 m, two inclined boards at 8 to 12 m before it, and the ground.
+
+    With "windows" the wall is the same again every 0.8 m; "wall" is the wall alone.
+    """
     rng = np.random.default_rng(5)
 
     def board(corner: Array, turn: Array, width_m: float, height_m: float) -> Surface:
@@ -48,20 +66,21 @@ def world() -> World:
         paint = _paint(rng, width_m, height_m)
         return Surface(corner, axes[:, 1], axes[:, 2], width_m, height_m, paint)
 
-    return World(
-        (
-            board(np.array([16.0, -30.0, -20.0]), np.zeros(3), 60.0, 23.0),
-            board(np.array([12.0, -8.0, -5.0]), np.array([0.0, 0.0, 0.5]), 5.0, 7.0),
-            board(np.array([8.0, 1.5, -3.0]), np.array([0.0, 0.1, -0.6]), 4.5, 5.0),
-            board(np.array([16.0, -30.0, 3.0]), np.array([0.0, -np.pi / 2, 0.0]), 60.0, 30.0),
-        ),
-        Texture.from_image(np.full((4, 4), 90, dtype=np.uint8)),
+    wall = board(np.array([16.0, -30.0, -20.0]), np.zeros(3), 60.0, 23.0)
+    before_it = (
+        board(np.array([12.0, -8.0, -5.0]), np.array([0.0, 0.0, 0.5]), 5.0, 7.0),
+        board(np.array([8.0, 1.5, -3.0]), np.array([0.0, 0.1, -0.6]), 4.5, 5.0),
+        board(np.array([16.0, -30.0, 3.0]), np.array([0.0, -np.pi / 2, 0.0]), 60.0, 30.0),
     )
+    if scenery == "windows":
+        wall = replace(wall, texture=_windows(60.0, 23.0, every_m=0.8))
+    surfaces = (wall,) if scenery == "wall" else (wall, *before_it)
+    return World(surfaces, Texture.from_image(np.full((4, 4), 90, dtype=np.uint8)))
 
 
 @cache
-def _renderer(camera: Camera, imaging: Imaging) -> Renderer:
-    return Renderer(world(), camera, imaging)
+def _renderer(camera: Camera, imaging: Imaging, scenery: Scenery) -> Renderer:
+    return Renderer(world(scenery), camera, imaging)
 
 
 def photograph(
@@ -69,9 +88,10 @@ def photograph(
     rng: np.random.Generator | None = None,
     camera: Camera = PINHOLE,
     imaging: Imaging | None = None,
+    scenery: Scenery = "boards",
 ) -> Image:
     """Return a picture; with an rng, with the sensor's noise."""
-    renderer = _renderer(camera, imaging or Imaging())
+    renderer = _renderer(camera, imaging or Imaging(), scenery)
     return renderer.render(world_from_body @ MOUNTING, rng)
 
 
@@ -81,22 +101,30 @@ def painted_map(
     n: int = 500,
     noise_px: float = 0.25,
     bodies: tuple[Pose, ...] = BODIES,
+    recognisable: bool = False,
+    scenery: Scenery = "boards",
 ) -> LandmarkMap:
     """Return the map of places that are visible from all of its keyframes.
 
-    Poses are true; a landmark lies on the truth up to its depth, which is as wrong
-    as ``noise_px`` in the keyframes leave it.
+    With ``recognisable`` they are what a detector finds in the first one. Poses are
+    true; a landmark lies on the truth up to its depth, which is as wrong as
+    ``noise_px`` in the keyframes leave it.
     """
     cams = [body @ MOUNTING for body in bodies]
     size = np.array([camera.width_px, camera.height_px])
     found = rng.uniform(20.0, size - 21.0, (8 * n, 2))
+    if recognisable:
+        found = detect(
+            photograph(bodies[0], None, camera, scenery=scenery), "akaze", FeatureOptions()
+        ).pixels
+        found = rng.permutation(found)
     rays = np.column_stack([camera.ideal_from_pixels(found), np.ones(len(found))])
-    hits = world().intersect(cams[0].translation, rays @ cams[0].rotation.T)
+    hits = world(scenery).intersect(cams[0].translation, rays @ cams[0].rotation.T)
     points = hits.points_world[np.isfinite(hits.distance)]
     seen = np.stack([camera.project(cam.inverse().apply(points)) for cam in cams], axis=1)
     visible = ((seen > 12.0) & (seen < size - 13.0)).all(axis=(1, 2))
     for cam in cams:
-        again = world().intersect(cam.translation, points - cam.translation).points_world
+        again = world(scenery).intersect(cam.translation, points - cam.translation).points_world
         visible &= np.linalg.norm(again - points, axis=1) < 1e-3
     points, seen = points[visible][:n], seen[visible][:n]
     baseline = min(float(np.linalg.norm(b.translation)) for b in bodies[1:])
@@ -108,7 +136,7 @@ def painted_map(
         keyframes=tuple(
             Keyframe(
                 i + 1, 0, body, MOUNTING, camera,
-                encode_image(photograph(body, rng, camera), 90),
+                encode_image(photograph(body, rng, camera, scenery=scenery), 90),
             )
             for i, body in enumerate(bodies)
         ),

@@ -74,36 +74,46 @@ def fly(
     speed_m_s: float = 1.0,
     attitude: bool = True,
     turn_rad_s: float = 0.4,
+    step_s: float = STEP_S,
+    held_from: int | None = None,
 ) -> Flight:
-    """Move and measure exactly as the filter believes: white acceleration, biased attitude."""
+    """Move and measure exactly as the filter believes: white acceleration, biased attitude.
+
+    From frame ``held_from`` on, where fixes end, the acceleration stays what it is.
+    """
     position, velocity = rng.standard_normal(3), speed_m_s * rng.standard_normal(3)
     rotation = matrix_from_euler(*(0.3 * rng.standard_normal(3)))
     rate = turn_rad_s * rng.standard_normal(3)
     ned_from_world = matrix_from_euler(0.01, -0.02, 1.5)
     sigma = np.deg2rad(options.attitude_sigma_deg)
     poses, velocities, attitudes = [], [], []
-    for _ in range(n):
+    shove = np.zeros(3)
+    for k in range(n):
         poses.append(Pose(rotation, position))
         velocities.append(velocity)
         sample = ned_from_world @ rotation @ exp_so3(sigma * rng.standard_normal(3))
         attitudes.append(sample if attitude else None)
-        shove = options.acceleration_m_s2 * rng.standard_normal(3)
-        position = position + velocity * STEP_S + 0.5 * shove * STEP_S**2
-        velocity = velocity + shove * STEP_S
-        turned = rate * STEP_S
+        if held_from is None or k <= held_from:
+            shove = options.acceleration_m_s2 * rng.standard_normal(3)
+        position = position + velocity * step_s + 0.5 * shove * step_s**2
+        velocity = velocity + shove * step_s
+        turned = rate * step_s
         if not attitude:
-            turned = np.deg2rad(options.turn_rate_deg_s) * STEP_S * rng.standard_normal(3)
+            turned = np.deg2rad(options.turn_rate_deg_s) * step_s * rng.standard_normal(3)
         rotation = rotation @ exp_so3(turned)
     return Flight(poses, np.array(velocities), attitudes)
 
 
 def filtered(
-    flight: Flight, fix_of: Callable[[Pose], Localized], options: FilterOptions
+    flight: Flight,
+    fix_of: Callable[[Pose], Localized],
+    options: FilterOptions,
+    step_ns: int = STEP_NS,
 ) -> list[FilterState]:
     state = started(fix_of(flight.poses[0]), 0, flight.attitudes[0], options)
     states = [state]
     for k in range(1, len(flight.poses)):
-        predicted = predict(state, k * STEP_NS, flight.attitudes[k], options)
+        predicted = predict(state, k * step_ns, flight.attitudes[k], options)
         assert predicted is not None
         after = update(predicted, fix_of(flight.poses[k]))
         # One honest fix in ten thousand is refused by bad luck.
@@ -162,21 +172,48 @@ def test_errors_are_as_large_as_stated(attitude: bool, n: int) -> None:
     assert_consistent(errors, sigma)
 
 
-def test_predictions_err_as_much_as_stated() -> None:
+@pytest.mark.parametrize("per_s", [5, 30])
+def test_predictions_err_as_much_as_stated(per_s: int) -> None:
+    """A second without a fix, at any frame rate: who brakes goes on braking."""
     rng = np.random.default_rng(3)
     options = replace(STEADY, speed_m_s=2.0)
+    step_s, step_ns = 1.0 / per_s, 1_000_000_000 // per_s
+    last_fix, n = 2 * per_s, 3 * per_s
     errors, sigma = [], []
     for _ in range(60):
-        flight = fly(rng, 15, options, speed_m_s=options.speed_m_s)
-        states = filtered(replace(flight, poses=flight.poses[:10]), noisy(rng), options)
-        state: FilterState | None = states[-1]
-        for k in range(10, 15):
+        flight = fly(
+            rng, n + 1, options, speed_m_s=options.speed_m_s, step_s=step_s, held_from=last_fix
+        )
+        fixed = replace(flight, poses=flight.poses[: last_fix + 1])
+        state: FilterState | None = filtered(fixed, noisy(rng), options, step_ns)[-1]
+        for k in range(last_fix + 1, n + 1):
             assert state is not None
-            state = predict(state, k * STEP_NS, flight.attitudes[k], options)
+            state = predict(state, k * step_ns, flight.attitudes[k], options)
         assert state is not None
         errors.append(state.prior().world_from_body.local(flight.poses[-1]))
         sigma.append(state.prior().covariance)
     assert_consistent(errors, sigma)
+
+
+@pytest.mark.parametrize("attitude", [True, False], ids=["attitude", "no attitude"])
+def test_a_prediction_is_as_uncertain_in_one_step_as_in_many(attitude: bool) -> None:
+    """Braking and turning by 90 degrees for a second without a fix."""
+    options = replace(FilterOptions(), attitude_sigma_deg=1e-6)
+    turns = [matrix_from_euler(0.0, 0.0, np.pi / 2 * part) for part in np.linspace(0, 1, 31)]
+    start = settled(turns[0] if attitude else None)
+    many: FilterState | None = start
+    for k, turn in enumerate(turns[1:], start=1):
+        assert many is not None
+        at_ns = start.at_ns + k * 1_000_000_000 // 30
+        many = predict(many, at_ns, turn if attitude else None, options)
+    once = predict(start, start.at_ns + 1_000_000_000, turns[-1] if attitude else None, options)
+    assert many is not None
+    assert once is not None
+    np.testing.assert_allclose(many.pose_covariance(), once.pose_covariance(), rtol=2e-3, atol=1e-6)
+    sigma = np.sqrt(np.diag(many.pose_covariance() - start.pose_covariance()))
+    assert np.all(sigma[:3] > 0.49 * options.acceleration_m_s2)
+    yaw = 0.02 * np.pi / 2 if attitude else np.deg2rad(options.turn_rate_deg_s)
+    assert 0.98 * yaw < sigma[5] < 1.3 * yaw
 
 
 def keyframe_errors(rng: np.random.Generator) -> tuple[Array, Array]:

@@ -60,6 +60,8 @@ class Flight:
         proposed: (drone, frame) that a peer said a pose of, and how far it was off, m;
             without a fix of its own such a frame has only that.
         starved: (drone, frame) without a fix of its own.
+        coasted: (drone, frame) refused, and sent by attitude and motion alone.
+        features: (drone, frame) whose own fix rests on features, not on patches.
         error: (drone, frame) to the (6,) error of its pose, as MAVLink puts it.
     """
 
@@ -72,6 +74,8 @@ class Flight:
     unlogged: frozenset[tuple[str, int]] = frozenset()
     proposed: Mapping[tuple[str, int], float] = field(default_factory=dict)
     starved: frozenset[tuple[str, int]] = frozenset()
+    coasted: frozenset[tuple[str, int]] = frozenset()
+    features: frozenset[tuple[str, int]] = frozenset()
     error: ErrorOf = field(default=lambda _drone, _frame: np.zeros(6))
 
 
@@ -141,7 +145,7 @@ def _log(name: str, n: int, flight: Flight, revision: str, n_bytes: int) -> list
         if (name, k) in flight.unlogged:
             continue
         outcome, reason = "localized", None
-        if (name, k) in flight.refused:
+        if (name, k) in flight.refused | flight.coasted:
             outcome, reason = "refused", "9 of 30 <landmarks>"
         if (name, k) in flight.dropped:
             outcome = "dropped"
@@ -149,6 +153,10 @@ def _log(name: str, n: int, flight: Flight, revision: str, n_bytes: int) -> list
         if outcome == "localized":
             source = "intra" if (name, k) not in flight.proposed else "fused"
             source = "inter" if (name, k) in flight.starved else source
+        by: str | None = "features" if (name, k) in flight.features else "patches"
+        by = "peer" if source == "inter" else by
+        if source is None:
+            by = "motion" if (name, k) in flight.coasted else None
         if source in ("intra", "fused"):
             lines.append(_estimate(n, k, flight.error(name, k)))
         if (name, k) in flight.proposed:
@@ -158,7 +166,7 @@ def _log(name: str, n: int, flight: Flight, revision: str, n_bytes: int) -> list
             {"kind": "frame", "source": source, "sequence": k, "captured_at_ns": at_ns(n, k),
              "outcome": outcome,
              "reason": reason, "latency_ms": _latency_ms(k, outcome), "matched": 150 - k,
-             "inliers": 100 - k}
+             "inliers": 100 - k, "by": by}
         )  # fmt: skip
     lines.append(
         {"kind": "summary", "frames": {}, "refusals": {}, "cpu_s": 1.5, "wall_s": 3.0,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sitl.processes import FlightError
+from sitl.reliance import RELIANCES
 from sitl.report import report_of, write_report
 from sitl.result import FlightResult, gather
 from sitl.trajectory_files import write_trajectories
@@ -115,6 +116,54 @@ def test_the_report_tells_whence_the_poses_came_and_how_good_each_source_was(
     nobody = report["drones"]["mav0"]["sources"]
     assert (nobody["nees_median"]["inter"], nobody["proposals"]) == (None, 0)
     assert "Whence the poses" in page_of(result, out)
+
+
+def test_the_report_tells_what_every_pose_relies_on(tmp_path: Path) -> None:
+    flight = Flight(
+        n_frames=10,
+        features=frozenset({("mav1", 0)}),
+        proposed={("mav1", 2): 0.1, ("mav1", 4): 0.1},
+        starved=frozenset({("mav1", 4)}),
+        coasted=frozenset({("mav1", 5), ("mav1", 6)}),
+        refused=frozenset({("mav1", 7)}),
+        dropped=frozenset({("mav1", 9)}),
+    )
+    result, report, out = reported(tmp_path, flight)
+    drone = report["drones"]["mav1"]
+    assert drone["relies_on"] == {
+        "patches": 0.4, "features": 0.1, "peer": 0.1, "motion": 0.2, "nothing": 0.2,
+    }  # fmt: skip
+    # What nobody measured is not localized, though it was sent.
+    assert (drone["localized_share"], drone["frames_refused"]) == (pytest.approx(0.6), 3)
+    assert len(result.drones[1].estimates.at_ns) == 8
+    assert report["drones"]["mav0"]["relies_on"]["patches"] == 1.0
+    assert not [event for event in report["events"] if event["kind"] == "harness"]
+    page = page_of(result, out)
+    strip = page[page.index("What the poses rely on") : page.index("Whence the poses")]
+    assert strip.count("<svg role=") == 1
+    for _, ink in RELIANCES.values():  # in the strip, in its legend and in the table's head
+        assert strip.count(ink) >= 3
+
+
+def test_a_log_of_before_patches_says_what_it_knew(tmp_path: Path) -> None:
+    flight = Flight(
+        n_frames=4, proposed={("mav1", 1): 0.1}, starved=frozenset({("mav1", 1)}),
+        refused=frozenset({("mav1", 2)}),
+    )  # fmt: skip
+    plan, out = leave_behind(tmp_path, flight)
+    for path in (out / "run").glob("*/flight.jsonl"):
+        path.write_text(re.sub(r', "by": ("\w+"|null)', "", path.read_text()))
+    said = report_of(gather(plan, out))["drones"]["mav1"]["relies_on"]
+    assert said == {"patches": 0.0, "features": 0.5, "peer": 0.25, "motion": 0.0, "nothing": 0.25}
+
+
+def test_a_coasted_pose_that_was_not_received_is_said_aloud(tmp_path: Path) -> None:
+    plan, out = leave_behind(tmp_path, Flight(coasted=frozenset({("mav1", 5)})))
+    path = out / "mav1" / "received.jsonl"
+    kept = [row for row in path.read_text().splitlines() if str(at_ns(1, 5) // 1000) not in row]
+    path.write_text("\n".join(kept) + "\n")
+    said = [event.reason for event in gather(plan, out).events if event.kind == "harness"]
+    assert said == ["1 frames by motion by the log, 0 poses received"]
 
 
 def test_errors_come_out_as_they_were_put_in(tmp_path: Path) -> None:
@@ -293,7 +342,7 @@ def test_the_page_fetches_nothing_and_shows_every_plot(tmp_path: Path) -> None:
     assert page.open == []
     assert all(a.startswith(("#", "data:image/png;base64,")) for a in page.addresses)
     assert not re.search(r"url\((?!#)|@import", text)
-    assert text.count("<svg role=") == 4
+    assert text.count("<svg role=") == 5
     assert "paper <&>" in page.text
     assert "9 of 30 <landmarks>" in page.text
     assert "nan" not in re.sub(r"<[^>]*>", " ", text).lower().split()

@@ -106,3 +106,13 @@ def test_landmarks_behind_the_camera_fix_nothing() -> None:
     _, start, system = both(np.random.default_rng(3), CAMERAS[0])
     behind = Pose(start.rotation @ np.diag([-1.0, -1.0, 1.0]), start.translation)
     assert converged(rows(behind), *system, np.zeros((6, 6)), _SCALES)[1] == SINGULAR
+
+
+@pytest.mark.parametrize("n_distinct", [1, 2])
+def test_landmarks_all_in_a_place_or_two_fix_nothing(n_distinct: int) -> None:
+    """However many they are; and nothing is raised in the middle of a frame."""
+    _, start, system = both(np.random.default_rng(3), CAMERAS[0])
+    mounting, ideal, slopes, points, covariances, pixel = system
+    same = np.arange(40) % n_distinct
+    few = (mounting, ideal[same], slopes[same], points[same], covariances[same], pixel[same])
+    assert converged(rows(start), *few, np.zeros((6, 6)), _SCALES)[1] != CONVERGED

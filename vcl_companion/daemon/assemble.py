@@ -88,7 +88,9 @@ async def _run(config: Config) -> int:
     autopilot = AutopilotLink(config.autopilot, config.system_id, clock)
     health = Health(autopilot, log)
     outcomes = FrameOutcomes(camera, clock, health, log)
-    estimator = Estimator(config.filter, config.localization, lambda why: log.event("jump", why))
+    # The paper's pipeline sends what it has measured, and nothing else.
+    motion = config.filter if config.pipeline == "default" else replace(config.filter, coast_s=0.0)
+    estimator = Estimator(motion, config.localization, lambda why: log.event("jump", why))
     # Frames never wait for a map that is being built: one thread for each.
     vision, mapping = Worker("vision"), Worker("mapping")
     # Before anybody is told that we are here: no frame has to wait for the compiler.

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from vcl_companion.cameras.source import CameraSource, Frame
 from vcl_companion.daemon.estimator import Estimator
-from vcl_companion.daemon.flight_log import FlightLog, PoseSource
+from vcl_companion.daemon.flight_log import Basis, FlightLog, PoseSource
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.inter_target import Asked, InterTarget
@@ -19,8 +19,8 @@ from vcl_companion.daemon.mailbox import Mailbox
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot import AutopilotLink
-from vcl_companion.localization.intra import Localized, NotLocalized, Recognised
-from vcl_companion.localization.pipeline import PipelineOptions, localize
+from vcl_companion.localization.intra import Localized, NotLocalized
+from vcl_companion.localization.pipeline import Effort, PipelineOptions, is_doubtful, localize
 from vcl_companion.localization.pose_filter import FilterState, NotFused
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.wire.pose_messages import PoseProposal
@@ -31,6 +31,10 @@ _log = logging.getLogger(__name__)
 ATTITUDE_WAIT_S = 0.1
 # How long the last frames of a stream may take.
 _LAST_FRAMES_S = 5.0
+# How often features are asked about a pose that few patches agree on, and how often a second
+# detector looks for a drone that is lost: it takes as long as ten frames.
+_DOUBT_EVERY_S = 5.0
+_FALL_BACK_EVERY_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +104,8 @@ class Companion:
         self._mailbox = Mailbox()
         self._over = asyncio.Event()
         self._vain: StoredMap | None = None
+        self._sent_at_ns = -1
+        self._doubted_at_s = self._fell_back_at_s = -math.inf
 
     async def read_camera(self) -> None:
         """Move frames from the camera to the mailbox until the stream ends and all are answered.
@@ -178,6 +184,8 @@ class Companion:
         attitude = await self._autopilot.attitude_at(at_ns, ATTITUDE_WAIT_S)
         ned_from_body = None if attitude is None else attitude.ned_from_body
         predicted = self._estimator.predicted(at_ns, ned_from_body)
+        now_s = asyncio.get_running_loop().time()
+        may_fall_back = now_s >= self._fell_back_at_s + _FALL_BACK_EVERY_S
         fix = await asyncio.get_running_loop().run_in_executor(
             self._executor,
             localize,
@@ -189,7 +197,12 @@ class Companion:
             predicted.prior() if predicted else None,
             ned_from_body,
             self._options,
+            Effort(now_s >= self._doubted_at_s + _DOUBT_EVERY_S, may_fall_back),
         )
+        if isinstance(fix, Localized) and is_doubtful(fix):
+            self._doubted_at_s = now_s
+        if isinstance(fix, NotLocalized) and may_fall_back:
+            self._fell_back_at_s = now_s
         refused = self._take(frame, fix, ned_from_body)
         sigma_m = math.inf if refused else self._estimator.sigma_m
         asked = self._inter.begin(frame, ned_from_body, stored.revision, sigma_m)
@@ -208,7 +221,7 @@ class Companion:
         newer = await self._next_map(stored)
         if newer is not None:
             return await self._localize(frame, newer)
-        self._outcomes.refuse(frame, refused)
+        self._give_up(frame, refused)
         return None
 
     def _take(
@@ -232,7 +245,7 @@ class Companion:
         )
         if isinstance(state, NotLocalized):
             return state
-        return self._send(frame, state, "intra", fix.n_matched, fix.n_inliers, fix.by)
+        return self._send(frame, state, "intra", fix.by, fix.n_matched, fix.n_inliers)
 
     async def _hear_peers(self, open_frame: _AskedPeers) -> None:
         """Fuse what peers say of a frame, answer it, and fuse what comes too late for that."""
@@ -245,7 +258,7 @@ class Companion:
         elif state is None:
             again = await self._given_up(asked.frame, stored, refused)
         else:
-            unsent = self._send(asked.frame, state, "inter")
+            unsent = self._send(asked.frame, state, "inter", "peer")
             if unsent is None:
                 self._outcomes.close(asked.frame)
             else:
@@ -273,9 +286,9 @@ class Companion:
         frame: Frame,
         state: FilterState,
         source: PoseSource,
+        by: Basis,
         n_matched: int = 0,
         n_inliers: int = 0,
-        by: Recognised | None = None,
     ) -> NotLocalized | None:
         """Send the pose of a frame, at its own time; or say why it cannot be."""
         sent = self._autopilot.send_pose(
@@ -286,8 +299,24 @@ class Companion:
         )
         if not sent:
             return NotLocalized("the pose's covariance is not finite", n_matched, n_inliers)
-        self._outcomes.sent(frame, source, n_matched, n_inliers, by)
+        self._sent_at_ns = max(self._sent_at_ns, frame.captured_at_ns)
+        self._outcomes.sent(frame, source, by, n_matched, n_inliers)
         return None
+
+    def _give_up(self, frame: Frame, why: NotLocalized) -> None:
+        """Refuse a frame; while the last fix is fresh, attitude and motion still say where it is.
+
+        Not when the autopilot has heard of a later frame: a pose of the past that
+        nobody has measured is no news.
+        """
+        at_ns = frame.captured_at_ns
+        state = self._estimator.coasted_at(at_ns) if at_ns > self._sent_at_ns else None
+        coasted = state is not None and self._autopilot.send_pose(
+            state.world_from_body, state.pose_covariance(), at_ns, self._estimator.n_resets
+        )
+        if coasted:
+            self._sent_at_ns = at_ns
+        self._outcomes.refuse(frame, why, coasted=coasted)
 
     def _drop(self, frame: Frame) -> None:
         """Answer a frame whose place a newer one took before it was looked at."""

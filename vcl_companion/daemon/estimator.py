@@ -109,6 +109,20 @@ class Estimator:
             self._history.append(predicted, None, ned_from_body)
         self._note(at_ns)
 
+    def coasted_at(self, at_ns: int) -> FilterState | None:
+        """Return where attitude and motion alone put a frame that gave no fix.
+
+        None when that tells too little: the last fix is too long ago, the position
+        too vague, without an attitude, or while the frames contradict the state.
+        """
+        state = self._history.at(at_ns)
+        if state is None or state.ned_from_body is None or self._n_contradicted:
+            return None
+        if at_ns - state.fixed_at_ns > self._options.coast_s * 1e9:
+            return None
+        variances = np.linalg.eigvalsh(state.pose_covariance()[:3, :3])
+        return state if variances[-1] <= self._localization.max_sigma_m**2 else None
+
     def take_fix(
         self,
         predicted: FilterState | None,

@@ -21,7 +21,11 @@ from vcl_companion.localization.intra import Recognised
 _log = logging.getLogger(__name__)
 
 PoseSource = Literal["intra", "inter", "fused"]
-"""Whence a frame's pose: its own fix, a peer's proposal, or both."""
+"""Whence a localized frame's pose: its own fix, a peer's proposal, or both."""
+
+Basis = Recognised | Literal["peer", "motion"]
+"""What a sent pose relies on: the map by patches or by features, a peer's word alone, or
+attitude and motion since the last of these. Where there is none, nothing was sent."""
 
 _UPPER = np.triu_indices(6)
 # Reasons hold numbers, and some are a peer's words: beyond so many they share one count.
@@ -64,9 +68,9 @@ class FlightLog:
         matched: int = 0,
         inliers: int = 0,
         source: PoseSource | None = None,
-        by: Recognised | None = None,
+        by: Basis | None = None,
     ) -> None:
-        """Write what became of a frame; ``by``: what its own pose rests on, if it has one."""
+        """Write what became of a frame; ``by``: what the pose sent for it relies on, if one was."""
         self.frames[outcome] += 1
         if outcome == "refused":
             known = reason in self.refusals or len(self.refusals) < _MAX_REASONS

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 from vcl_companion.cameras.source import CameraSource, Frame, Outcome
 from vcl_companion.clock import Clock, ManualClock
-from vcl_companion.daemon.flight_log import FlightLog, PoseSource
+from vcl_companion.daemon.flight_log import Basis, FlightLog, PoseSource
 from vcl_companion.daemon.health import Health
-from vcl_companion.localization.intra import NotLocalized, Recognised
+from vcl_companion.localization.intra import NotLocalized
 
 _log = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ class _Sent:
     n_matched: int
     n_inliers: int
     source: PoseSource
-    by: Recognised | None
+    by: Basis
 
 
 class FrameOutcomes:
@@ -59,12 +59,12 @@ class FrameOutcomes:
         self,
         frame: Frame,
         source: PoseSource,
+        by: Basis,
         n_matched: int = 0,
         n_inliers: int = 0,
-        by: Recognised | None = None,
     ) -> None:
         """Note that a frame's pose is with the autopilot; ``close`` answers the frame."""
-        self._health.localized()
+        self._health.localized(by_peers=source == "inter")
         latency_ms = self._latency_ms(frame)
         self._sent[frame.sequence] = _Sent(latency_ms, n_matched, n_inliers, source, by)
 
@@ -83,10 +83,16 @@ class FrameOutcomes:
         )
         self._answer(frame, "localized")
 
-    def refuse(self, frame: Frame, why: NotLocalized) -> None:
-        """Say that a frame gave no pose, and why: nothing was sent."""
+    def refuse(self, frame: Frame, why: NotLocalized, coasted: bool = False) -> None:
+        """Say that a frame gave no pose, and why.
+
+        Args:
+            frame: which.
+            why: it gave none.
+            coasted: whether the autopilot got one by attitude and motion alone; else nothing.
+        """
         self._health.refused(why.reason)
-        self._log_refused(frame, why)
+        self._log_refused(frame, why, "motion" if coasted else None)
 
     def drop(self, frame: Frame) -> None:
         """Answer a frame whose place a newer one took before it was looked at."""
@@ -109,7 +115,7 @@ class FrameOutcomes:
             else:
                 self._log_refused(frame, NotLocalized("the service has ended"))
 
-    def _log_refused(self, frame: Frame, why: NotLocalized) -> None:
+    def _log_refused(self, frame: Frame, why: NotLocalized, by: Basis | None = None) -> None:
         self._log.frame(
             frame.sequence,
             frame.captured_at_ns,
@@ -118,6 +124,7 @@ class FrameOutcomes:
             latency_ms=self._latency_ms(frame),
             matched=why.n_matched,
             inliers=why.n_inliers,
+            by=by,
         )
         _log.debug("frame %d: %s", frame.sequence, why.reason)
         self._answer(frame, "refused")

@@ -37,14 +37,15 @@ class Health:
         self._last_answer_s: float | None = None
         self._last_fix_s: float | None = None
 
-    def localized(self) -> None:
-        """Note that a frame gave a pose which was sent."""
+    def localized(self, by_peers: bool = False) -> None:
+        """Note that a frame gave a pose which was sent; ``by_peers``: it rests on them alone."""
         now_s = asyncio.get_running_loop().time()
         self._last_answer_s = self._last_fix_s = now_s
-        self._tell(ServiceState.ACTIVE, Severity.INFO, "localized", "found")
+        text = "localized by peers alone" if by_peers else "localized"
+        self._tell(ServiceState.ACTIVE, Severity.INFO, text, "found")
 
     def refused(self, reason: str) -> None:
-        """Note that a frame gave no pose, and why: nothing was sent."""
+        """Note that a frame gave no pose, and why."""
         now_s = asyncio.get_running_loop().time()
         self._last_answer_s = now_s
         if self._last_fix_s is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -20,6 +20,7 @@ from vcl_companion.vision.resection import (
     Resection,
     ResectionOptions,
     Sightings,
+    Undecided,
     refine,
     search,
 )
@@ -31,6 +32,8 @@ _SURE_PX = 8.0
 # One landmark may decide this much of a pose that a prediction led to, and of one found without:
 # nothing else speaks for that one, and on few far landmarks it is metres off and sure of itself.
 _LED_LEVERAGE, _FOUND_LEVERAGE = 0.4, 0.25
+# A pose that rests on single landmarks is taken to be off by so many times what it says.
+_UNDECIDED = 3.0
 
 
 @dataclass(frozen=True)
@@ -127,11 +130,19 @@ class Localized:
 
 @dataclass(frozen=True)
 class NotLocalized:
-    """No pose from this image, and why."""
+    """No pose from this image, and why.
+
+    Attributes:
+        reason: for people.
+        n_matched: landmarks matched.
+        n_inliers: of these, how many agreed.
+        vague: a pose that was found, not to be believed, good enough to look from.
+    """
 
     reason: str
     n_matched: int = 0
     n_inliers: int = 0
+    vague: Prior | None = field(default=None, compare=False)
 
 
 def believed(
@@ -148,6 +159,7 @@ def believed(
             f"too uncertain: {sigma:.1f} m, {options.max_sigma_m:.1f} m allowed",
             n_matched,
             n_inliers,
+            Prior(fix.world_from_body, covariance),
         )
     if ned_from_body is not None:
         reason = disagreement(fix.world_from_body.rotation, ned_from_body, options)
@@ -299,12 +311,19 @@ class _Matcher:
         self, attempt: _Matched, guided: bool, ned_from_body: Array | None
     ) -> Localized | NotLocalized:
         """Say how certain the pose is, and whether it is believed."""
-        result = attempt.result
         n_matched = len(attempt.landmarks)
-        if isinstance(result, NotFound):
-            return NotLocalized(result.reason, n_matched)
-        n_inliers = int(result.inliers.sum())
-        fix = Localized(
+        if isinstance(attempt.result, Undecided):
+            vague = self._fix(attempt, attempt.result.found, guided)
+            widened = _UNDECIDED**2 * vague.covariance()
+            led = Prior(vague.world_from_body, widened) if np.all(np.isfinite(widened)) else None
+            return NotLocalized(attempt.result.reason, n_matched, vague=led)
+        if isinstance(attempt.result, NotFound):
+            return NotLocalized(attempt.result.reason, n_matched)
+        return believed(self._fix(attempt, attempt.result, guided), ned_from_body, self.options)
+
+    def _fix(self, attempt: _Matched, result: Resection, guided: bool) -> Localized:
+        n_matched, n_inliers = len(attempt.landmarks), int(result.inliers.sum())
+        return Localized(
             result.world_from_body,
             result.noise_covariance,
             *self._map_error(result, attempt.landmarks[result.inliers]),
@@ -316,7 +335,6 @@ class _Matcher:
             n_inliers,
             covered_share(attempt.pixels[result.inliers], self.camera),
         )
-        return believed(fix, ned_from_body, self.options)
 
     def _map_error(self, result: Resection, landmarks: NDArray[np.intp]) -> tuple[Array, Array]:
         """Return the pose's (6, 6) covariance by the landmarks' own errors, and its map lever."""

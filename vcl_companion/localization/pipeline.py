@@ -4,7 +4,8 @@ Two pipelines. The paper's looks for features in every frame and matches them
 against the map. The default follows the map's patches from where the drone is
 expected, and looks for features only when that fails: at the start, when lost,
 when what the patches say is not believed. A pose found by features then leads
-the patches once, so that what is sent is as good as the frame gives.
+the patches once, so that what is sent is as good as the frame gives; one too
+uncertain to be believed may still lead, if then most patches are where they should be.
 """
 
 from __future__ import annotations
@@ -30,6 +31,12 @@ from vcl_companion.vision.features import FeatureOptions, Image, detect
 Pipeline = Literal["default", "paper"]
 
 
+# Fewer than this share of the patches tried: they may be the ones that are wrong.
+_DOUBTFUL = 0.3
+# Share of the patches tried that must agree when what led to them was not to be believed.
+_LED_BY_A_VAGUE_POSE = 0.5
+
+
 @dataclass(frozen=True)
 class PipelineOptions:
     """What the steps of a frame are tuned by; see each of them."""
@@ -37,6 +44,22 @@ class PipelineOptions:
     features: FeatureOptions
     localization: LocalizationOptions
     tracking: TrackingOptions
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What may be tried that takes as long as several frames.
+
+    Attributes:
+        may_doubt: whether features are asked about a pose that few patches agree on.
+        may_fall_back: whether a second detector is asked when the first one fails.
+    """
+
+    may_doubt: bool = True
+    may_fall_back: bool = True
+
+
+ALL_EFFORT = Effort()
 
 
 def localize(
@@ -48,8 +71,13 @@ def localize(
     prior: Prior | None,
     ned_from_body: Array | None,
     options: PipelineOptions,
+    effort: Effort = ALL_EFFORT,
 ) -> Localized | NotLocalized:
     """Find the drone's pose in the map; one job for one thread, without a lock.
+
+    A prediction that is wrong finds what is wrong of the map, and is confirmed by
+    it. Where few patches agree, the features of the whole map may be asked whether
+    there is a place that more agree on.
 
     Args:
         image: (H, W) grey.
@@ -60,27 +88,41 @@ def localize(
         prior: where the drone is expected, or None.
         ned_from_body: (3, 3) attitude by the autopilot at that instant, or None.
         options: of the steps.
+        effort: what there is time for.
 
     Returns:
         The pose with its covariance in parts, or why there is none: what the
         features said, for they were asked last.
     """
+    tracked: Localized | NotLocalized | None = None
     if templates is not None and prior is not None:
         tracked = track(
             image, camera, body_from_cam, templates, prior, ned_from_body,
             options.tracking, options.localization,
         )  # fmt: skip
         if isinstance(tracked, Localized):
-            return tracked
-    found = _recognised(image, camera, body_from_cam, index, prior, ned_from_body, options)
-    if templates is None or isinstance(found, NotLocalized):
-        return found
-    closer = track(
-        image, camera, body_from_cam, templates,
-        Prior(found.world_from_body, found.covariance()), ned_from_body,
-        options.tracking, options.localization,
-    )  # fmt: skip
-    return closer if isinstance(closer, Localized) else found
+            if not (effort.may_doubt and is_doubtful(tracked)):
+                return tracked
+            again = _recognised(
+                image, camera, body_from_cam, index, templates, None, ned_from_body, options
+            )
+            more = isinstance(again, Localized) and again.n_inliers > tracked.n_inliers
+            return again if more else tracked
+    found = _recognised(
+        image, camera, body_from_cam, index, templates, prior, ned_from_body, options
+    )
+    by = index.fallback if effort.may_fall_back else None
+    while by is not None and isinstance(found, NotLocalized):
+        found = _recognised(
+            image, camera, body_from_cam, by, templates, prior, ned_from_body, options
+        )
+        by = by.fallback
+    return found
+
+
+def is_doubtful(fix: Localized) -> bool:
+    """Return whether few of the patches that should be seen agree on a pose."""
+    return fix.by == "patches" and fix.n_inliers < _DOUBTFUL * fix.n_matched
 
 
 def _recognised(
@@ -88,15 +130,27 @@ def _recognised(
     camera: Camera,
     body_from_cam: Pose,
     index: MapIndex,
+    templates: Templates | None,
     prior: Prior | None,
     ned_from_body: Array | None,
     options: PipelineOptions,
 ) -> Localized | NotLocalized:
-    """Find the pose by features of one detector after the other."""
+    """Find the pose by one detector's features, and let it lead the patches."""
     found = localize_intra(
         detect(image, index.detector, options.features),
         camera, body_from_cam, index, prior, ned_from_body, options.localization,
     )  # fmt: skip
-    if isinstance(found, Localized) or index.fallback is None:
+    if isinstance(found, Localized):
+        leads: Prior | None = Prior(found.world_from_body, found.covariance())
+        least = 0.0
+    else:
+        leads, least = found.vague, _LED_BY_A_VAGUE_POSE
+    if templates is None or leads is None:
         return found
-    return _recognised(image, camera, body_from_cam, index.fallback, prior, ned_from_body, options)
+    closer = track(
+        image, camera, body_from_cam, templates, leads, ned_from_body,
+        options.tracking, options.localization,
+    )  # fmt: skip
+    if isinstance(closer, Localized) and closer.n_inliers >= least * closer.n_matched:
+        return closer
+    return found

@@ -45,6 +45,8 @@ class FilterOptions:
         attitude_drift_deg_s: change of the attitude's offset in a second, 1 sigma.
         attitude_turn_error: change of that offset as a share of the angle turned, 1 sigma.
         turn_rate_deg_s: unknown rotation when the autopilot sends no attitude, 1 sigma.
+        coast_s: how long after the last fix a pose by attitude and motion alone is
+            still sent; 0: never.
     """
 
     acceleration_m_s2: float = 3.0
@@ -53,6 +55,7 @@ class FilterOptions:
     attitude_drift_deg_s: float = 0.1
     attitude_turn_error: float = 0.02
     turn_rate_deg_s: float = 45.0
+    coast_s: float = 1.0
 
     def __post_init__(self) -> None:
         for name in (
@@ -68,6 +71,8 @@ class FilterOptions:
             raise ValueError(
                 f"attitude_turn_error must lie in [0, 1), got {self.attitude_turn_error}"
             )
+        if not 0 <= self.coast_s <= _MAX_COAST_S:
+            raise ValueError(f"coast_s must lie in 0..{_MAX_COAST_S:.0f}, got {self.coast_s}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +89,7 @@ class FilterState:
         own_map_covariance: (6, 6) local, the used landmarks' own errors.
         fixed_at_ns: instant of the last fix.
         n_jumps: how often the estimate moved by more than its covariance explains.
+        fixed_attitude: (3, 3) the attitude sample of the last fix, or None.
     """
 
     at_ns: int
@@ -95,6 +101,7 @@ class FilterState:
     own_map_covariance: Array
     fixed_at_ns: int
     n_jumps: int
+    fixed_attitude: Array | None = None
 
     def pose_covariance(self) -> Array:
         """Return (6, 6) covariance of the pose, local perturbation, the map's error in it."""
@@ -136,6 +143,7 @@ def started(
         fix.own_map_covariance,
         at_ns,
         0,
+        ned_from_body,
     )
 
 
@@ -167,6 +175,10 @@ def predict(
 ) -> FilterState | None:
     """Carry the state to a later instant (eq. 5): constant velocity, the autopilot's attitude.
 
+    What is unknown of the motion is taken to last until the next fix: who brakes or
+    turns goes on doing so. Uncertainty therefore grows with the time, and the angle,
+    since the last fix, however many predictions lie between.
+
     Args:
         state: at its own instant.
         at_ns: the instant wanted; one before the state's is taken for the state's own.
@@ -184,21 +196,22 @@ def predict(
     transition[_P, _V] = np.eye(3) * dt_s
     transition[_W] = 0.0
     process = np.zeros((n, n))
-    # White acceleration, constant over the step: moves position by a dt^2/2, speed by a dt.
-    shove = np.zeros((n, 3))
-    shove[_P], shove[_V] = np.eye(3) * 0.5 * dt_s**2, np.eye(3) * dt_s
-    process += options.acceleration_m_s2**2 * shove @ shove.T
+    # Unknown acceleration since the last fix: moves position by a t^2/2, speed by a t. What the
+    # state has of it already is carried over and counts once.
+    since_s = (state.at_ns - state.fixed_at_ns) * 1e-9
+    had, has = _shoved(since_s, n), _shoved(since_s + dt_s, n)
+    had = transition @ had
+    process += options.acceleration_m_s2**2 * (has @ has.T - had @ had.T)
     if ned_from_body is not None and state.ned_from_body is not None:
         offset = state.world_from_ned
-        turn_rad = float(np.linalg.norm(log_so3(state.ned_from_body.T @ ned_from_body)))
         variance = np.deg2rad(options.attitude_drift_deg_s) ** 2 * dt_s
-        variance += (options.attitude_turn_error * turn_rad) ** 2
+        variance += options.attitude_turn_error**2 * _turned_squared(state, ned_from_body)
     else:
         # The last rotation itself becomes the reference, and may have turned meanwhile.
         attitude = np.eye(3) if ned_from_body is None else ned_from_body
         offset = state.world_from_body.rotation @ attitude.T
         transition[_B, _W] = state.world_from_body.rotation
-        variance = (np.deg2rad(options.turn_rate_deg_s) * dt_s) ** 2
+        variance = np.deg2rad(options.turn_rate_deg_s) ** 2 * ((since_s + dt_s) ** 2 - since_s**2)
     process[_B, _B] += np.eye(3) * variance
     process[_W, _W] = np.eye(3) * _sample_sigma_rad(ned_from_body, options) ** 2
     rotation = offset @ (np.eye(3) if ned_from_body is None else ned_from_body)
@@ -249,10 +262,9 @@ def update(predicted: FilterState, fix: Localized) -> FilterState | NotLocalized
     keep = np.eye(len(predicted.covariance)) - gain @ observation
     covariance = keep @ predicted.covariance @ keep.T + gain @ noise @ gain.T
     return replace(
-        _stepped(predicted, step),
+        _stepped(_fixed(predicted), step),
         covariance=0.5 * (covariance + covariance.T),
         own_map_covariance=fix.own_map_covariance,
-        fixed_at_ns=predicted.at_ns,
     )
 
 
@@ -296,9 +308,7 @@ def fuse(
     units = np.diag([1.0, 1.0, 1.0, arm_m, arm_m, arm_m]) ** 2
     if np.trace(units @ weighed.covariance) > _NEWS * np.trace(units @ own):
         # Widening what the proposal says nothing of would cost more.
-        return (
-            state if state.fixed_at_ns == state.at_ns else replace(state, fixed_at_ns=state.at_ns)
-        )
+        return state if state.fixed_at_ns == state.at_ns else _fixed(state)
     omega = min(max(weighed.omega, _LEAST_OMEGA), 1.0 - _LEAST_OMEGA)
     rotation = state.world_from_body.rotation
     observation = _to_pose(rotation, len(state.covariance))
@@ -322,11 +332,15 @@ def fuse(
     fused[:, _N_OWN:] *= np.sqrt(omega)
     fused[_N_OWN:, _N_OWN:] = state.covariance[_N_OWN:, _N_OWN:]
     return replace(
-        _stepped(state, step),
+        _stepped(_fixed(state), step),
         covariance=0.5 * (fused + fused.T),
         own_map_covariance=np.zeros((6, 6)),
-        fixed_at_ns=state.at_ns,
     )
+
+
+def _fixed(state: FilterState) -> FilterState:
+    """Return the state as one that has just been fixed."""
+    return replace(state, fixed_at_ns=state.at_ns, fixed_attitude=state.ned_from_body)
 
 
 def _stepped(state: FilterState, step: Array) -> FilterState:
@@ -341,6 +355,27 @@ def _stepped(state: FilterState, step: Array) -> FilterState:
         velocity_world=state.velocity_world + step[_V],
         world_from_ned=turned @ state.world_from_ned,
     )
+
+
+def _shoved(since_s: float, n: int) -> Array:
+    """Return (n, 3) how a constant acceleration has moved the error state."""
+    out = np.zeros((n, 3))
+    out[_P], out[_V] = np.eye(3) * 0.5 * since_s**2, np.eye(3) * since_s
+    return out
+
+
+def _turned_squared(state: FilterState, ned_from_body: Array) -> float:
+    """Return by how much the square of the angle turned since the last fix has grown, rad^2.
+
+    Turning back takes no error away for certain: it is never less than the step's own.
+    """
+    before = state.ned_from_body if state.ned_from_body is not None else ned_from_body
+    origin = state.fixed_attitude if state.fixed_attitude is not None else before
+    had, has, step = (
+        float(np.linalg.norm(log_so3(a.T @ b)))
+        for a, b in ((origin, before), (origin, ned_from_body), (before, ned_from_body))
+    )
+    return max(has**2 - had**2, step**2)
 
 
 def _sample_sigma_rad(ned_from_body: Array | None, options: FilterOptions) -> float:

@@ -18,6 +18,7 @@ from vcl_companion.localization.intra import (
     Prior,
     believed,
 )
+from vcl_companion.localization.patch_pose import PatchPoses
 from vcl_companion.mapping.templates import Templates
 from vcl_companion.vision.features import Image
 from vcl_companion.vision.information import covariance_of
@@ -32,14 +33,12 @@ from vcl_companion.vision.patches import (
     lens_of,
     pyramid_of,
 )
-from vcl_companion.vision.pose_kernels import CONVERGED, converged, gained, supported
+from vcl_companion.vision.pose_kernels import gained
 
-_CHI2_2_99 = 9.21
 _MAX_LEVERAGE = 0.4
 _ROBUST_LOSS = 1.1136
 _SINGULAR = 1e-9
 _MAX_ROUNDS = 3
-_WIDE, _NARROW = np.array([8.0, 3.0, 1.0]), np.array([1.0])
 # Patches warped and begun so near to where they are need no second look.
 _WELL_PREDICTED_PX = 0.5
 
@@ -156,6 +155,8 @@ class _Tracker:
         self._anchors: Anchors = templates.anchors
         self._options = options
         self._belief = belief
+        size_px = (camera.width_px, camera.height_px)
+        self._poses = PatchPoses(self._anchors, body_from_cam, size_px, belief.min_inliers)
 
     def located(self, prior: Prior, ned_from_body: Array | None) -> Localized | NotLocalized:
         options = self._options
@@ -174,7 +175,7 @@ class _Tracker:
                 return coarse
             pose = coarse
         found = self._aligned(rows, pose, np.zeros(len(rows)), 0, options.least_score)
-        refined = self._refined(found, pose, None, _WIDE)
+        refined = self._poses.agreed(found, pose)
         if isinstance(refined, NotLocalized):
             return refined
         if float(np.median(np.abs(found.pixels - found.predicted))) > _WELL_PREDICTED_PX:
@@ -203,7 +204,7 @@ class _Tracker:
         pose = prior.world_from_body
         reach = np.clip(radii, 2.0**level, options.max_radius_px)
         found = self._aligned(rows, pose, reach, level, options.coarse_score)
-        return self._refined(found, pose, prior, _WIDE)
+        return self._poses.led(found, pose, prior)
 
     def _aligned(
         self, rows: NDArray[np.int64], pose: Pose, radii: Array, level: int, score: float
@@ -228,33 +229,6 @@ class _Tracker:
         )
         return found.of(found.found)
 
-    def _refined(
-        self, found: Alignment, pose: Pose, prior: Prior | None, scales: Array
-    ) -> Pose | NotLocalized:
-        n = len(found.anchors)
-        if n < self._belief.min_inliers:
-            return NotLocalized(f"{n} patches found, {self._belief.min_inliers} needed", n)
-        known = np.zeros((6, 6))
-        if prior is not None:
-            known = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
-        matrix, outcome = converged(*self._system(pose, found), known, scales)
-        if outcome != CONVERGED:
-            return NotLocalized("the patches found do not fix a pose", n)
-        return Pose(matrix[:, :3], matrix[:, 3])
-
-    def _system(
-        self, pose: Pose, found: Alignment
-    ) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
-        return (
-            np.ascontiguousarray(pose.matrix()[:3]),
-            np.ascontiguousarray(self._mounting.matrix()[:3]),
-            found.ideal,
-            found.slopes,
-            self._anchors.points_world[found.anchors],
-            self._anchors.spread[found.anchors],
-            found.noise + found.misplaced,
-        )
-
     def _judged(
         self,
         found: Alignment,
@@ -266,13 +240,11 @@ class _Tracker:
         """Refine a last time, and say how certain the pose is."""
         uncertainty = self._templates.uncertainty
         for _ in range(_MAX_ROUNDS):
-            refined = self._refined(found, pose, None, _NARROW)
+            refined = self._poses.settled(found, pose)
             if isinstance(refined, NotLocalized):
                 return refined
             pose = refined
-            agrees, normal, j_pose, j_point, information = supported(
-                *self._system(pose, found), 2.0 * _CHI2_2_99
-            )
+            agrees, normal, j_pose, j_point, information = self._poses.support(found, pose)
             n = int(agrees.sum())
             if n < self._belief.min_inliers:
                 least = self._belief.min_inliers

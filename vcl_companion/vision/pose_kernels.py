@@ -17,9 +17,9 @@ from vcl_companion.vision.compiled import compiled
 Ints = NDArray[np.int64]
 
 _MIN_DEPTH_M = 1e-3
+# What is left of a diagonal's element by elimination, as a share of it, that is no rounding.
+_LEAST_PIVOT = 1e-13
 CONVERGED, SINGULAR, DIVERGED = 0, 1, 2
-# What is left of a diagonal element when the others are known; less is rounding.
-_LEAST_PIVOT = 1e-12
 
 
 @compiled
@@ -92,35 +92,6 @@ def converged(
             if length < (1e-4 if scale > 1.0 else 1e-7):
                 break
     return now, CONVERGED
-
-
-@compiled
-def _solved(normal: Array, rhs: Array, step: Array) -> bool:
-    """Solve a (6, 6) normal matrix by Cholesky; False where it is singular or not finite.
-
-    The matrix is overwritten. Pivots are judged against the diagonal, whatever its units.
-    """
-    for c in range(6):
-        own = normal[c, c]
-        for k in range(c):
-            normal[c, c] -= normal[c, k] * normal[c, k]
-        if not (own > 0.0 and normal[c, c] > _LEAST_PIVOT * own and math.isfinite(rhs[c])):
-            return False
-        normal[c, c] = math.sqrt(normal[c, c])
-        for r in range(c + 1, 6):
-            for k in range(c):
-                normal[r, c] -= normal[r, k] * normal[c, k]
-            normal[r, c] /= normal[c, c]
-    for c in range(6):
-        step[c] = rhs[c]
-        for k in range(c):
-            step[c] -= normal[c, k] * step[k]
-        step[c] /= normal[c, c]
-    for c in range(5, -1, -1):
-        for k in range(c + 1, 6):
-            step[c] -= normal[k, c] * step[k]
-        step[c] /= normal[c, c]
-    return True
 
 
 @compiled
@@ -324,6 +295,37 @@ def informed(
     out[0], out[1], out[2] = yy / determinant, -xy / determinant, xx / determinant
     a, b = residual[0], residual[1]
     return float(out[0] * a * a + 2.0 * out[1] * a * b + out[2] * b * b)
+
+
+@compiled
+def _solved(normal: Array, rhs: Array, step: Array) -> bool:
+    """Fill the solution of (6, 6) normal equations by Cholesky; False where there is none.
+
+    LAPACK's solver would raise, in the middle of a frame.
+    """
+    root = np.zeros((6, 6))
+    for c in range(6):
+        left = normal[c, c]
+        for k in range(c):
+            left -= root[c, k] ** 2
+        if not left > _LEAST_PIVOT * normal[c, c]:
+            return False
+        root[c, c] = math.sqrt(left)
+        for d in range(c + 1, 6):
+            below = normal[d, c]
+            for k in range(c):
+                below -= root[d, k] * root[c, k]
+            root[d, c] = below / root[c, c]
+    for c in range(6):
+        step[c] = rhs[c]
+        for k in range(c):
+            step[c] -= root[c, k] * step[k]
+        step[c] /= root[c, c]
+    for c in range(5, -1, -1):
+        for k in range(c + 1, 6):
+            step[c] -= root[k, c] * step[k]
+        step[c] /= root[c, c]
+    return True
 
 
 @compiled

@@ -7,7 +7,7 @@ image, so that a badly triangulated depth cannot pull the pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,6 +113,13 @@ class Resection:
     rms_px: float
 
 
+@dataclass(frozen=True)
+class Undecided(NotFound):
+    """A pose that does not stand without single landmarks: they may be wrong, it may be right."""
+
+    found: Resection = field(compare=False)
+
+
 def search(sightings: Sightings, options: ResectionOptions, seed: int = 0) -> Pose | NotFound:
     """Find the pose that the sightings make most meaningful, without any first guess."""
     usable = sightings.usable()
@@ -145,16 +152,23 @@ def refine(
         The pose with its support, or why it is not to be believed.
     """
     usable = sightings.usable()
+    first: Resection | None = None
+
+    def failed(why: NotFound) -> NotFound:
+        return why if first is None else Undecided(why.reason, first)
+
     for n_rounds in range(_MAX_ROUNDS):
         if usable.sum() < options.min_inliers:
             word = "left" if n_rounds else "matched"
-            return NotFound(f"{usable.sum()} landmarks {word}, {options.min_inliers} needed")
+            least = options.min_inliers
+            return failed(NotFound(f"{usable.sum()} landmarks {word}, {least} needed"))
         pose = _converged(world_from_body, _of(sightings, usable))
         if isinstance(pose, NotFound):
-            return pose
+            return failed(pose)
         found = _supported(pose, sightings, usable, options)
         if isinstance(found, NotFound):
-            return found
+            return failed(found)
+        first = first or found
         # On a flat scene one landmark off the plane, a wrong match perhaps, would
         # fix the pose all by itself: the pose has to stand without such landmarks.
         decisive = _leverage(found) > options.max_leverage
@@ -162,7 +176,7 @@ def refine(
             return found
         usable[np.flatnonzero(found.inliers)[decisive]] = False
         world_from_body = found.world_from_body
-    return NotFound("single landmarks decide the pose: the others do not fix it")
+    return failed(NotFound("single landmarks decide the pose: the others do not fix it"))
 
 
 def _converged(pose: Pose, sightings: Sightings) -> Pose | NotFound:

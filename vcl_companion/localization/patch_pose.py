@@ -1,0 +1,111 @@
+"""The pose that patches found in one frame agree on, whatever covers a part of it (eq. 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.localization.intra import NotLocalized, Prior
+from vcl_companion.vision.patches import Alignment, Anchors
+from vcl_companion.vision.pose_kernels import CONVERGED, converged, supported
+
+_CHI2_2_99 = 9.21
+_WIDE, _NARROW = np.array([8.0, 3.0, 1.0]), np.array([1.0])
+# Fewer than this share of the patches found on a pose: something else may have led to it.
+_AGREED = 0.7
+_N_STRIPS = 3
+
+System = tuple[Array, Array, Array, Array, Array, Array, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class PatchPoses:
+    """Poses from the patches of one camera.
+
+    Attributes:
+        anchors: of the map.
+        body_from_cam: the camera's mounting.
+        size_px: width and height of its image.
+        min_inliers: landmarks that must agree.
+    """
+
+    anchors: Anchors
+    body_from_cam: Pose
+    size_px: tuple[int, int]
+    min_inliers: int
+
+    def led(self, found: Alignment, pose: Pose, prior: Prior | None) -> Pose | NotLocalized:
+        """Refine a pose that may be some px off; with ``prior``, no farther than that allows."""
+        return self._refined(found, pose, prior, _WIDE)
+
+    def settled(self, found: Alignment, pose: Pose) -> Pose | NotLocalized:
+        """Refine a pose that is right to a few sigmas of its patches."""
+        return self._refined(found, pose, None, _NARROW)
+
+    def agreed(self, found: Alignment, pose: Pose) -> Pose | NotLocalized:
+        """Refine a pose that may be some px off, and return the one that most patches agree on.
+
+        A thing that moves has patches that agree with each other, and when it is
+        near or well seen they may draw the refinement to them. Where many disagree
+        with what came out, every third of the image, upright and across, is left out
+        in turn.
+        """
+        best = self.led(found, pose, None)
+        if isinstance(best, NotLocalized):
+            return best
+        most = self._n_agreeing(found, best)
+        if most >= _AGREED * len(found.anchors):
+            return best
+        for part in self._without_a_third(found.pixels):
+            other = self.led(found.of(part), pose, None)
+            if isinstance(other, NotLocalized):
+                continue
+            n = self._n_agreeing(found, other)
+            if n > most:
+                best, most = other, n
+        return best
+
+    def support(
+        self, found: Alignment, pose: Pose
+    ) -> tuple[NDArray[np.int64], Array, Array, Array, Array]:
+        """Return who agrees with a pose, and how they fix it (``pose_kernels.supported``)."""
+        return supported(*self._system(pose, found), 2.0 * _CHI2_2_99)
+
+    def _n_agreeing(self, found: Alignment, pose: Pose) -> int:
+        return int(self.support(found, pose)[0].sum())
+
+    def _without_a_third(self, pixels: Array) -> Iterator[NDArray[np.bool_]]:
+        for axis in (0, 1):
+            strip = np.floor((pixels[:, axis] + 0.5) * _N_STRIPS / self.size_px[axis])
+            for k in range(_N_STRIPS):
+                yield strip != k
+
+    def _refined(
+        self, found: Alignment, pose: Pose, prior: Prior | None, scales: Array
+    ) -> Pose | NotLocalized:
+        n = len(found.anchors)
+        if n < self.min_inliers:
+            return NotLocalized(f"{n} patches found, {self.min_inliers} needed", n)
+        known = np.zeros((6, 6))
+        if prior is not None:
+            known = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
+        matrix, outcome = converged(*self._system(pose, found), known, scales)
+        if outcome != CONVERGED:
+            return NotLocalized("the patches found do not fix a pose", n)
+        return Pose(matrix[:, :3], matrix[:, 3])
+
+    def _system(self, pose: Pose, found: Alignment) -> System:
+        return (
+            np.ascontiguousarray(pose.matrix()[:3]),
+            np.ascontiguousarray(self.body_from_cam.matrix()[:3]),
+            found.ideal,
+            found.slopes,
+            self.anchors.points_world[found.anchors],
+            self.anchors.spread[found.anchors],
+            found.noise + found.misplaced,
+        )
