@@ -92,11 +92,14 @@ def large_map(of: list[Place], n_landmarks: int) -> LandmarkMap:
         observed[row : row + len(seen), a] = seen[:, 0]
         observed[row : row + len(seen), b] = seen[:, 1]
         row += len(seen)
-    first, second = (k.world_from_body.translation for k in keyframes[:2])
+    bodies = [keyframe.world_from_body.translation for keyframe in keyframes]
+    # Two views leave the scale open: those of one place, and those tied.
+    known = tuple(
+        KnownDistance(a, b, float(np.linalg.norm(bodies[a] - bodies[b])), 0.01) for a, b in columns
+    )
     return LandmarkMap(
-        tuple(keyframes), np.concatenate(points), observed, _NOISE_PX, ("akaze",),
-        (KnownDistance(0, 1, float(np.linalg.norm(first - second)), 0.01),), b"",
-    )  # fmt: skip
+        tuple(keyframes), np.concatenate(points), observed, _NOISE_PX, ("akaze",), known, b""
+    )
 
 
 def _place(scene: Scene, number: int) -> Place:

@@ -121,7 +121,7 @@ def _cost_cells(table: CostTable) -> list[tuple[str, ...]]:
         for row in table.rows
     ]
     growths = {growth.of: growth.exponent for growth in table.growths()}
-    rows.append(("growth", "", *(f"^{growths[name]:.2f}" for name in COLUMNS), ""))
+    rows.append(("growth", "", *(f"^{round(growths[name], 2) + 0.0:.2f}" for name in COLUMNS), ""))
     return rows
 
 

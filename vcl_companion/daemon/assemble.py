@@ -27,16 +27,16 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
-from vcl_companion.daemon.usage import cpu_s, peak_resident_mb
+from vcl_companion.daemon.usage import cpu_s, give_back, peak_resident_mb
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.errors import VclError
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.peers import PeerLink
 from vcl_companion.localization.pipeline import PipelineOptions
+from vcl_companion.mapping.warm_up import warm_up
 from vcl_companion.recording.sensor import read_sensor
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.transfer import Transfers
-from vcl_companion.vision.warm_up import warm_up
 
 _log = logging.getLogger(__name__)
 
@@ -111,6 +111,7 @@ async def _run(config: Config) -> int:
     # a tenth of a second and the interpreter's lock.
     gc.collect()
     gc.freeze()
+    give_back()
     rng = np.random.default_rng()
     exchange = Exchange(
         config.system_id,
