@@ -261,10 +261,16 @@ def paper(
 
 @main.command()
 @click.argument(
-    "what", metavar="[steps|robust]", default="steps", type=click.Choice(["steps", "robust"])
+    "what",
+    metavar="[steps|robust|speed|realtime]",
+    default="steps",
+    type=click.Choice(["steps", "robust", "speed", "realtime"]),
 )
 @click.option(
-    "--only", multiple=True, metavar="NAME", help="A step or cell, or part of a name (repeatable)."
+    "--only",
+    multiple=True,
+    metavar="NAME",
+    help="A step, cell or part, or a piece of a name (repeatable).",
 )
 @click.option(
     "--seeds", type=click.IntRange(min=1), help="Scenes in each cell of robust; 200 by default."
@@ -272,7 +278,7 @@ def paper(
 @click.option("--quick", is_flag=True, help="Seconds: see that it runs, not how well.")
 @click.option("--out", default=Path("out/bench"), show_default=True, metavar="DIR", type=_FOLDER)
 def bench(
-    what: Literal["steps", "robust"],
+    what: Literal["steps", "robust", "speed", "realtime"],
     only: tuple[str, ...],
     seeds: int | None,
     quick: bool,
@@ -283,6 +289,9 @@ def bench(
     steps: the time of each step and whether its answer is right, in minutes.
     robust: poses among wrong matches, cell by cell, in hours; what is finished is
     kept in the output folder and not run again.
+    speed: a frame beside the paper's, relocalization, cold start, map extension, and how
+    costs grow with the map and the image, in minutes.
+    realtime: three daemons at 30 Hz: dropped frames, latency, memory, load, in minutes.
     """
     # One thread for everybody: this counts before numpy is loaded.
     for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):

@@ -22,8 +22,8 @@ from sitl.report import write_report
 from sitl.result import Event, gather
 from sitl.swarm import Swarm
 from sitl.trajectory_files import write_trajectories
+from vcl_companion.mapping.warm_up import warm_up
 from vcl_companion.recording import read_recording
-from vcl_companion.vision.warm_up import warm_up
 
 _ANSWER_TIMEOUT_S = 60.0
 

@@ -131,7 +131,10 @@ def _drone(drone: DroneResult, duration_s: float) -> dict[str, Any]:
         "nees_median": scores.nees_median if scores else None,
         "relies_on": shares(log.frames),
         "sources": _sources(drone),
-        "latency_ms": {"p50": _percentile(looked_at, 50.0), "p99": _percentile(looked_at, 99.0)},
+        "latency_ms": {
+            name: _percentile(looked_at, share)
+            for name, share in (("p50", 50.0), ("p95", 95.0), ("p99", 99.0))
+        },
         "first_frame_ms": first[0] if first else None,
         "cpu_share": summary.cpu_s / summary.wall_s if summary and summary.wall_s > 0 else None,
         "resident_mb": summary.resident_mb if summary else None,

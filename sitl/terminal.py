@@ -61,7 +61,7 @@ def show_report(console: Console, report: Mapping[str, Any], out: Path) -> None:
     table.add_column("drone", no_wrap=True)
     for title in (
         "frames", "localized\n%", "refused", "dropped", "ATE\nm", "aligned\nm",
-        "yaw\ndeg", "p50\nms", "p99\nms",
+        "yaw\ndeg", "p50\nms", "p99\nms", "CPU\n%", "RSS\nMB",
     ):  # fmt: skip
         table.add_column(title, justify="right", no_wrap=True)
     for name, drone in report["drones"].items():
@@ -76,6 +76,8 @@ def show_report(console: Console, report: Mapping[str, Any], out: Path) -> None:
             _number(drone["yaw_rmse_deg"], 2),
             _number(drone["latency_ms"]["p50"], 1),
             _number(drone["latency_ms"]["p99"], 1),
+            _number(None if drone["cpu_share"] is None else 100.0 * drone["cpu_share"], 0),
+            _number(drone["resident_mb"], 0),
         )
     console.print(table)
     for event in report["events"]:

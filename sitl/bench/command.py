@@ -13,13 +13,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bar
 
 from sitl.bench.cases import grid
+from sitl.bench.realtime import bench_realtime
 from sitl.bench.robust import bench_robust
 from sitl.bench.robust_report import show_robust
+from sitl.bench.speed import PARTS, bench_speed
+from sitl.bench.speed_report import show_costs, show_figures, show_where
 from sitl.bench.steps import STEPS, bench_steps
 from sitl.bench.steps_report import show_steps
 from vcl_companion.errors import ConfigError
 
-What = Literal["steps", "robust"]
+What = Literal["steps", "robust", "speed", "realtime"]
 Progress = Callable[[str, int, int], None]
 
 _SEEDS = 200
@@ -34,7 +37,8 @@ class BenchOptions:
     """What is asked for.
 
     Attributes:
-        what: the times of each step, or poses among wrong matches.
+        what: the times of each step, poses among wrong matches, the speed of frames
+            and maps, or daemons in the time of their cameras.
         only: names of parts, or pieces of them; empty for everything.
         seeds: scenes per cell of ``robust``; None for the usual number.
         quick: seconds instead of minutes and hours, to see that it runs.
@@ -52,10 +56,22 @@ def run_bench(out: Path, options: BenchOptions, console: Console) -> None:
     Raises:
         ConfigError: a name is nothing's, or the folder cannot be written.
     """
-    if options.what == "steps" and options.seeds is not None:
-        raise ConfigError("--seeds is for bench robust; steps has no scenes")
+    if options.what != "robust" and options.seeds is not None:
+        raise ConfigError(f"--seeds is for bench robust; {options.what} has no scenes")
+    if options.what == "realtime" and options.only:
+        raise ConfigError("--only: realtime has no parts")
     try:
         out.mkdir(parents=True, exist_ok=True)
+        if options.what == "speed":
+            _run_speed(out, options, console)
+            return
+        if options.what == "realtime":
+            with _shown(console) as progress:
+                daemons = bench_realtime(out, options.quick, _changes(progress))
+            for name, figures in daemons.items():
+                show_figures(console, figures, name)
+            show_where(console, out / "realtime.md")
+            return
         if options.what == "steps":
             steps = chosen(STEPS, [step.name for step in STEPS], options.only)
             with _shown(console) as progress:
@@ -72,6 +88,29 @@ def run_bench(out: Path, options: BenchOptions, console: Console) -> None:
         raise ConfigError(f"{out}: is a file; give a folder") from error
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written ({error.strerror})") from error
+
+
+def _run_speed(out: Path, options: BenchOptions, console: Console) -> None:
+    parts = tuple(chosen(PARTS, PARTS, options.only))
+    with _shown(console) as progress:
+        result = bench_speed(out, parts, options.quick, progress)
+    if result.figures:
+        show_figures(console, result.figures)
+    show_costs(console, result.tables)
+    show_where(console, out / "speed.md")
+
+
+def _changes(progress: Progress) -> Progress:
+    """Pass on what is new, not every frame of it."""
+    last = ""
+
+    def show(part: str, done: int, total: int) -> None:
+        nonlocal last
+        if part != last:
+            last = part
+            progress(part, done, total)
+
+    return show
 
 
 def chosen(things: Sequence[_T], names: Sequence[str], only: Sequence[str]) -> list[_T]:

@@ -84,19 +84,7 @@ def measured(step: str, entries: Sequence[Entry], effort: Effort) -> list[Measur
         # The first call compiles, loads and allocates; its answer is as good as any.
         accuracies.append(entry.judge(entry.run()))
         inner.append(1 + _LEAST_NS // max(_spent_ns(entry.run, 1), 1_000))
-    times: list[list[float]] = [[] for _ in entries]
-    until = time.perf_counter() + effort.budget_s
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        for done in range(effort.most):
-            if done >= effort.least and time.perf_counter() > until:
-                break
-            for entry, calls, mine in zip(entries, inner, times, strict=True):
-                mine.append(1e-6 * _spent_ns(entry.run, calls) / calls)
-    finally:
-        if was_on:
-            gc.enable()
+    times = interleaved([entry.run for entry in entries], effort, inner)
     first = float(np.median(times[0]))
     return [
         Measured(
@@ -110,6 +98,33 @@ def measured(step: str, entries: Sequence[Entry], effort: Effort) -> list[Measur
         )
         for entry, mine, accuracy in zip(entries, times, accuracies, strict=True)
     ]
+
+
+def interleaved(
+    runs: Sequence[Callable[[], Any]], effort: Effort, inner: Sequence[int] | None = None
+) -> list[list[float]]:
+    """Return the times of one call of each, ms, as often as there is time for all in turns.
+
+    Args:
+        runs: what is called.
+        effort: how long, how often.
+        inner: so many calls of each make one measurement; None: one.
+    """
+    calls = inner or [1] * len(runs)
+    times: list[list[float]] = [[] for _ in runs]
+    until = time.perf_counter() + effort.budget_s
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        for done in range(effort.most):
+            if done >= effort.least and time.perf_counter() > until:
+                break
+            for run, n, mine in zip(runs, calls, times, strict=True):
+                mine.append(1e-6 * _spent_ns(run, n) / n)
+    finally:
+        if was_on:
+            gc.enable()
+    return times
 
 
 def _spent_ns(run: Callable[[], Any], calls: int) -> int:

@@ -92,7 +92,9 @@ def test_a_localized_drone_asks_now_and_then_and_is_confirmed(tmp_path: Path) ->
     async def scenario() -> None:
         async with swarm(1, 2, path=tmp_path) as members:
             host = await members.start(1, MAP, inter=replace(INTER, every_n_frames=0))
-            target = await members.start(2, MAP, inter=replace(PATIENT, every_n_frames=2))
+            target = await members.start(
+                2, MAP, inter=replace(PATIENT, every_n_frames=2, least_interval_s=0.0)
+            )
             async with flying(host) as one, flying(target) as two:
                 one.give(0)
                 await one.server.answered()
@@ -107,6 +109,26 @@ def test_a_localized_drone_asks_now_and_then_and_is_confirmed(tmp_path: Path) ->
                 assert [by for _, by in two.bases()] == ["patches"] * 4
                 hosts = [line["host"] for line in target.lines("estimate")]
                 assert hosts == [None, None, 1, None, None, 1]
+
+    run(scenario())
+
+
+def test_many_frames_a_second_do_not_make_many_requests(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            host = await members.start(1, MAP, inter=replace(INTER, every_n_frames=0))
+            every = replace(PATIENT, every_n_frames=1, least_interval_s=0.5)
+            target = await members.start(2, MAP, inter=every)
+            async with flying(host) as one, flying(target) as two:
+                one.give(0)
+                await one.server.answered()
+                await knows_of(target, 1)
+                for k in range(4):  # 0.2 s apart
+                    two.give(k)
+                    await two.server.answered()
+                assert [source for _, _, source in two.sources()] == [
+                    "fused", "intra", "intra", "fused",
+                ]  # fmt: skip
 
     run(scenario())
 

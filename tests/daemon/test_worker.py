@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import threading
@@ -24,6 +25,18 @@ def test_things_are_done_in_turn_in_a_thread_of_their_own() -> None:
         assert [future.result(5.0) for future in futures] == [None] * 20
     assert done == list(range(20))
     assert names == {"vision"}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads have no niceness of their own")
+def test_one_thread_yields_to_the_others() -> None:
+    def niceness() -> int:
+        return os.getpriority(os.PRIO_PROCESS, 0)
+
+    with Worker("vision") as frames, Worker("mapping", yields=5) as maps:
+        ours = niceness()
+        assert frames.submit(niceness).result(5.0) == ours
+        assert maps.submit(niceness).result(5.0) == min(ours + 5, 19)
+    assert niceness() == ours
 
 
 def test_a_failure_is_told_and_the_next_thing_is_done() -> None:

@@ -67,7 +67,7 @@ def test_the_report_has_exactly_the_keys_that_others_read(tmp_path: Path) -> Non
     drone = report["drones"]["mav1"]
     assert keys <= set(drone)
     assert set(drone["rmse_m"]) == {"x", "y", "z"}
-    assert set(drone["latency_ms"]) == {"p50", "p99"}
+    assert set(drone["latency_ms"]) == {"p50", "p95", "p99"}
     assert {"revisions", "landmarks", "bytes"} <= set(report["map"])
     assert set(report["events"][0]) == {"at_s", "drone", "kind", "reason"}
     assert report["pipeline"] == "default"

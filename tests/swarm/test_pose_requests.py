@@ -52,6 +52,7 @@ def test_everybody_is_tried_then_the_surest_and_the_others_in_turn() -> None:
     "make",
     [
         lambda: InterMavOptions(every_n_frames=-1),
+        lambda: InterMavOptions(least_interval_s=-0.1),
         lambda: InterMavOptions(wait_s=0.0),
         lambda: InterMavOptions(max_hosts=0),
         lambda: InterMavOptions(request_quality=101),

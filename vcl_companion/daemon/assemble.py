@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
-import resource
 import signal
+import sys
 import time
 from collections.abc import Coroutine
 from contextlib import suppress
@@ -26,20 +27,24 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.usage import cpu_s, give_back, peak_resident_mb
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.errors import VclError
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.peers import PeerLink
 from vcl_companion.localization.pipeline import PipelineOptions
+from vcl_companion.mapping.warm_up import warm_up
 from vcl_companion.recording.sensor import read_sensor
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.transfer import Transfers
-from vcl_companion.vision.warm_up import warm_up
 
 _log = logging.getLogger(__name__)
 
 # A device that does not let go must not keep the flight log from its summary.
 _CLOSE_S = 3.0
+_SWITCH_S = 0.0005
+# Niceness of map making above the frames'; with half of them each gets half of the machine's time.
+_MAPPING_YIELDS = 8
 _END_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
@@ -58,6 +63,9 @@ def run_daemon(config: Config) -> int:
     # One core per thing: several daemons may share a machine, and OpenCV's own
     # threads make features depend on their number.
     cv2.setNumThreads(1)
+    # A frame takes the interpreter's lock some dozen times; whoever makes a map beside it
+    # gives it up after so long.
+    sys.setswitchinterval(_SWITCH_S)
     try:
         return asyncio.run(_run(config))
     finally:
@@ -92,7 +100,7 @@ async def _run(config: Config) -> int:
     motion = config.filter if config.pipeline == "default" else replace(config.filter, coast_s=0.0)
     estimator = Estimator(motion, config.localization, lambda why: log.event("jump", why))
     # Frames never wait for a map that is being built: one thread for each.
-    vision, mapping = Worker("vision"), Worker("mapping")
+    vision, mapping = Worker("vision"), Worker("mapping", _MAPPING_YIELDS)
     # Before anybody is told that we are here: no frame has to wait for the compiler.
     notify.status("compiling, once on this machine")
     warm = loop.run_in_executor(vision, warm_up)
@@ -101,6 +109,11 @@ async def _run(config: Config) -> int:
     stop.cancel()
     if warm.done():
         await warm
+    # What is there now stays for good: no later collection looks at it again, which took
+    # a tenth of a second and the interpreter's lock.
+    gc.collect()
+    gc.freeze()
+    give_back()
     rng = np.random.default_rng()
     exchange = Exchange(
         config.system_id,
@@ -147,7 +160,7 @@ async def _run(config: Config) -> int:
         exchange.on_heartbeat,
     )
     exchange.attach(peers)
-    began_at_s = time.monotonic()
+    began_at_s, began_cpu_s = time.monotonic(), cpu_s()
     try:
         await _until_ended(
             ended,
@@ -168,11 +181,10 @@ async def _run(config: Config) -> int:
             # What still runs is not waited for: an update takes seconds, and nobody wants it.
             vision.shutdown(wait=False, cancel_futures=True)
             mapping.shutdown(wait=False, cancel_futures=True)
-            usage = resource.getrusage(resource.RUSAGE_SELF)
             log.close(
-                cpu_s=usage.ru_utime + usage.ru_stime,
+                cpu_s=cpu_s() - began_cpu_s,
                 wall_s=time.monotonic() - began_at_s,
-                resident_mb=usage.ru_maxrss / 1024,
+                resident_mb=peak_resident_mb(),
                 peer_bytes_sent=peers.counters.bytes_out,
                 peer_bytes_received=peers.counters.bytes_in,
             )

@@ -102,6 +102,7 @@ class InterTarget:
         self._options = options
         self._request_id = int(rng.integers(1 << 32))
         self._n_since = 0
+        self._last_at_ns: int | None = None
         self._is_open = False
         self._asked: dict[int, Asked] = {}
 
@@ -122,18 +123,27 @@ class InterTarget:
         """
         self._n_since += math.isfinite(sigma_m)
         every_n = self._options.every_n_frames
-        is_due = sigma_m > self._options.weak_sigma_m or self._n_since >= every_n
+        is_due = sigma_m > self._options.weak_sigma_m or (
+            self._n_since >= every_n and self._is_long_ago(frame.captured_at_ns)
+        )
         if every_n == 0 or self._is_open or not is_due:
             return None
         hosts = self._hosts.choose(revision, self._options.max_hosts)
         if not hosts:
             return None
         self._n_since = 0
+        self._last_at_ns = frame.captured_at_ns
         self._is_open = True
         self._request_id = (self._request_id + 1) % (1 << 32)
         asked = Asked(self._request_id, frame, ned_from_body, revision, set(hosts))
         self._asked[asked.request_id] = asked
         return asked
+
+    def _is_long_ago(self, at_ns: int) -> bool:
+        """Whether the last request was made long enough before an instant."""
+        if self._last_at_ns is None:
+            return True
+        return at_ns - self._last_at_ns >= round(1e9 * self._options.least_interval_s)
 
     async def ask(self, asked: Asked) -> list[tuple[int, PoseProposal]]:
         """Send the request, and wait until all have answered or ``wait_s`` is over.

@@ -7,13 +7,17 @@ Uhlmann 1997) stays consistent whatever the correlation is.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, right_jacobian_so3
+
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+_FINE = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +70,7 @@ def intersect(
         fused = np.linalg.inv(omega * information_a + (1.0 - omega) * information_b)
         return float(np.trace(fused * np.outer(units, units)))
 
-    best = minimize_scalar(cost, bounds=(0.0, 1.0), method="bounded", options={"xatol": 1e-5})
-    omega = min((0.0, float(best.x), 1.0), key=cost)
+    omega = min((0.0, _least(cost), 1.0), key=cost)
     covariance = np.linalg.inv(omega * information_a + (1.0 - omega) * information_b)
     step = covariance @ ((1.0 - omega) * information_b @ difference)
     turned = np.eye(6)
@@ -88,6 +91,23 @@ def unlikeness(
     difference = first.local(second)
     bound = 2.0 * (first_covariance + second_covariance)
     return float(difference @ np.linalg.solve(bound, difference))
+
+
+def _least(cost: Callable[[float], float]) -> float:
+    """Return where in [0, 1] a convex cost is least, to 1e-5, by golden sections (Kiefer 1953)."""
+    low, high = 0.0, 1.0
+    left, right = 1.0 - _GOLDEN, _GOLDEN
+    at_left, at_right = cost(left), cost(right)
+    while high - low > _FINE:
+        if at_left <= at_right:
+            high, right, at_right = right, left, at_left
+            left = high - _GOLDEN * (high - low)
+            at_left = cost(left)
+        else:
+            low, left, at_left = left, right, at_right
+            right = low + _GOLDEN * (high - low)
+            at_right = cost(right)
+    return 0.5 * (low + high)
 
 
 def _inverse(covariance: Array) -> Array:

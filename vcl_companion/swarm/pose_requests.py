@@ -16,6 +16,8 @@ class InterMavOptions(InterOptions):
     Attributes:
         every_n_frames: localized frames from one request to the next; a frame
             that is refused asks anyway. 0: never asks, still answers.
+        least_interval_s: localized frames ask no more often, however many there are: an
+            answer costs each host a fifth of a second of one core.
         weak_sigma_m: a localized frame whose pose is less certain than this asks too.
         wait_s: a refused frame waits this long for an answer.
         max_hosts: peers asked at once.
@@ -24,6 +26,8 @@ class InterMavOptions(InterOptions):
     """
 
     every_n_frames: int = 10
+    # Ten frames at 5 Hz are due at the tenth, whatever their jitter.
+    least_interval_s: float = 1.8
     weak_sigma_m: float = 0.3
     wait_s: float = 1.0
     max_hosts: int = 2
@@ -34,6 +38,8 @@ class InterMavOptions(InterOptions):
         super().__post_init__()
         if not 0 <= self.every_n_frames <= 100_000:
             raise ValueError(f"every_n_frames must lie in 0..100000, got {self.every_n_frames}")
+        if not 0 <= self.least_interval_s <= 3600.0:
+            raise ValueError(f"least_interval_s must lie in 0..3600, got {self.least_interval_s}")
         if not self.weak_sigma_m > 0:
             raise ValueError(f"weak_sigma_m must be positive, got {self.weak_sigma_m}")
         if not 0 < self.wait_s <= 60.0:

@@ -155,7 +155,7 @@ class _Problem:
     """The observations of one adjustment, landmark by landmark, as the compiled loops read them."""
 
     def __init__(self, views: Views, cauchy_px: float) -> None:
-        seen = np.isfinite(views.ideal[:, :, 0])
+        seen = np.ascontiguousarray(np.isfinite(views.ideal[:, :, 0]))
         owner, view = np.nonzero(seen)
         self._first = np.searchsorted(owner, np.arange(len(views.points) + 1)).astype(np.int64)
         self._view = view.astype(np.int64)
@@ -197,7 +197,8 @@ class _Problem:
         self, views: Views
     ) -> tuple[Array, Array, Array, kernels.Ints, kernels.Ints, Array, Array]:
         """Return an estimate as the compiled loops take it."""
-        points = np.ascontiguousarray(views.points)
+        # Writable as all others are: for one that is not the kernels would be compiled anew.
+        points = np.array(views.points)
         bodies = _matrices(views.bodies)
         return (
             points, bodies, self._mountings, self._first, self._view, self._slopes, self._ideal
@@ -263,7 +264,7 @@ def normal_equations(views: Views, cauchy_px: float | None) -> NormalEquations:
         cross[seen, block] += np.einsum("nki,nkj->nij", weighted_pose, j_point)
     for known in views.distances:
         cost += _add_distance(views, known, pose_block, pose_rhs)
-    in_view = np.isfinite(views.ideal[:, :, 0])
+    in_view = np.ascontiguousarray(np.isfinite(views.ideal[:, :, 0]))
     return NormalEquations(pose_block, pose_rhs, point_block, point_rhs, cross, in_view, cost)
 
 

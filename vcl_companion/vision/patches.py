@@ -128,6 +128,11 @@ class Anchors:
     texture: Array
     images: KeyframeImages
 
+    def __post_init__(self) -> None:
+        # In another order the compiled loops would be compiled anew, while a frame waits.
+        for name in ("planes", "pixels", "points_world", "own", "spread", "texture"):
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name)))
+
 
 @dataclass(frozen=True, eq=False)
 class KeyframeImages:

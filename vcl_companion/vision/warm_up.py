@@ -14,6 +14,9 @@ from vcl_companion.geometry.rotation import Array
 from vcl_companion.vision import pose_kernels
 from vcl_companion.vision.absolute_pose import resect
 from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust
+from vcl_companion.vision.features import Features
+from vcl_companion.vision.guided_pairs import match_epipolar
+from vcl_companion.vision.hamming import hamming_index, nearest_two
 from vcl_companion.vision.patches import (
     AlignRules,
     Anchors,
@@ -38,6 +41,11 @@ def warm_up() -> None:
     essential_candidates(ideal_a, ideal_b, 320.0, rng)
     resect(ideal_b, points, 320.0, rng)
     eliminated(np.zeros((1, 6, 3)), np.zeros((1, 3, 3)), np.ones((1, 1), dtype=np.bool_))
+    descriptors = np.asarray(rng.integers(0, 255, (40, 61)), dtype=np.uint8)
+    nearest_two(descriptors, hamming_index(descriptors, np.arange(40)))
+    still = Features(320.0 * ideal_a, descriptors)
+    b_from_a = Pose(np.eye(3), np.array([1.0, 0.2, 0.1]))
+    match_epipolar(still, still, ideal_a, ideal_b, b_from_a, (0.1, 0.3), 320.0)
     _adjust(points)
     _track(rng)
 

@@ -1,0 +1,153 @@
+"""Map extension by three drones beside a tracking load, as a daemon's two threads do it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import count, cycle
+
+import numpy as np
+
+from sitl.bench.figures import Figure
+from sitl.bench.speed_frames import located
+from sitl.bench.speed_scene import FEATURES, MAPPING, Scene, Shot
+from vcl_companion.daemon.feature_memory import FeatureMemory
+from vcl_companion.daemon.map_offer import MapOffer, ReadyMap, ready_map
+from vcl_companion.daemon.worker import Worker
+from vcl_companion.errors import RecordingError
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.options import NoMap
+from vcl_companion.mapping.update import extended
+from vcl_companion.swarm.transfer import BlobKind
+from vcl_companion.wire.map_codec import encode_map, revision_of
+
+_RATE_HZ = 30.0
+_SPACING_S = 1.2
+
+
+@dataclass(frozen=True)
+class _Round:
+    """One extension: wall and processor time of it, and wall time until it can be flown on, s."""
+
+    extend_s: float
+    extend_cpu_s: float
+    ready_s: float
+    n_landmarks: int
+    n_keyframes: int
+
+
+def extension(scene: Scene, first: LandmarkMap, shots: list[Shot], n_rounds: int) -> list[Figure]:
+    """Extend a map round after round while another thread localizes 30 frames a second.
+
+    Args:
+        scene: what the drones see.
+        first: the map that they begin with.
+        shots: frames for the tracking load, near the start.
+        n_rounds: how many; every drone contributes one frame to each.
+
+    Raises:
+        RecordingError: a round gives no map.
+    """
+    vision, mapping = Worker("vision"), Worker("mapping")
+    memory = FeatureMemory(FEATURES)
+    data = encode_map(first)
+    ready = mapping.submit(_ready, data, memory).result()
+    contributed = [
+        [scene.shot(i, _SPACING_S * (k + 1)) for i in range(len(scene.scenario.drone))]
+        for k in range(n_rounds)
+    ]
+    load = _Load(vision, shots, ready)
+    alone_ms = load.during(lambda: time.sleep(1.0))
+    rounds: list[_Round] = []
+
+    def extend() -> None:
+        current = ready
+        for k, seen in enumerate(contributed):
+            result, current = mapping.submit(_round, current, seen, k, memory).result()
+            rounds.append(result)
+
+    beside_ms = load.during(extend)
+    for worker in (vision, mapping):
+        worker.shutdown()
+    walls = [r.extend_s for r in rounds]
+    last = rounds[-1]
+    size = f"{n_rounds} rounds, to {last.n_landmarks} landmarks in {last.n_keyframes} keyframes"
+    return [
+        Figure("map extension, median", float(np.median(walls)), "s", 0.6,
+               note=f"wall time beside the load; {size}"),
+        Figure("map extension, longest", float(np.max(walls)), "s"),
+        Figure("map extension, processor time", float(np.median([r.extend_cpu_s for r in rounds])),
+               "s", note="median"),
+        Figure("extended map made ready", float(np.median([r.ready_s for r in rounds])), "s",
+               note="wall time, in every drone"),
+        Figure("load alone, p95", float(np.quantile(alone_ms, 0.95)), "ms",
+               note=f"{len(alone_ms)} frames at {_RATE_HZ:g} Hz, wall time"),
+        Figure("load beside the extension, median", float(np.median(beside_ms)), "ms"),
+        Figure("load beside the extension, p95", float(np.quantile(beside_ms, 0.95)), "ms",
+               note=f"{len(beside_ms)} frames"),
+    ]  # fmt: skip
+
+
+def _ready(data: bytes, memory: FeatureMemory) -> ReadyMap:
+    return ready_map(MapOffer.of(BlobKind.MAP, data), None, "akaze", FEATURES, memory, True)
+
+
+def _round(
+    current: ReadyMap, seen: list[Shot], k: int, memory: FeatureMemory
+) -> tuple[_Round, ReadyMap]:
+    views = [shot.view(k + 1, detected=False) for shot in seen]
+    old = current.index.landmark_map
+    begun_s, cpu_s = time.perf_counter(), time.thread_time()
+    made = extended(
+        old, revision_of(current.data), views, memory.features, MAPPING, pyramid_of=memory.pyramid
+    )
+    extend_s, extend_cpu_s = time.perf_counter() - begun_s, time.thread_time() - cpu_s
+    if isinstance(made, NoMap):
+        raise RecordingError(f"round {k + 1}: the map cannot be extended: {made.reason}")
+    begun_s = time.perf_counter()
+    ready = _ready(encode_map(made), memory)
+    return (
+        _Round(
+            extend_s,
+            extend_cpu_s,
+            time.perf_counter() - begun_s,
+            len(made.points_world),
+            len(made.keyframes),
+        ),
+        ready,
+    )
+
+
+class _Load:
+    """Localizes frames in their own time by one thread, as the frames of a camera come."""
+
+    def __init__(self, vision: Worker, shots: list[Shot], ready: ReadyMap) -> None:
+        self._vision, self._shots, self._ready = vision, shots, ready
+
+    def during(self, work: Callable[[], None]) -> list[float]:
+        """Do some work, and return the wall time that each frame meanwhile took, ms."""
+        times: list[float] = []
+        over = threading.Event()
+
+        def frames() -> None:
+            begun_s = time.perf_counter()
+            for k, shot in zip(count(), cycle(self._shots), strict=False):
+                due_s = begun_s + k / _RATE_HZ
+                if over.wait(max(0.0, due_s - time.perf_counter())):
+                    return
+                prior = shot.predicted(np.random.default_rng(k))
+                asked_s = time.perf_counter()
+                self._vision.submit(located, shot, self._ready, True, prior).result()
+                times.append(1e3 * (time.perf_counter() - asked_s))
+
+        thread = threading.Thread(target=frames, name="camera")
+        located(self._shots[0], self._ready, True, None)
+        thread.start()
+        try:
+            work()
+        finally:
+            over.set()
+            thread.join()
+        return times

@@ -1,0 +1,70 @@
+"""What this process takes of the machine: told in the log's last line, and given back."""
+
+from __future__ import annotations
+
+import ctypes
+import resource
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+_STATUS = Path("/proc/self/status")
+_MAPS = Path("/proc/self/smaps")
+_MADV_DONTNEED = 4  # <linux/mman.h>, the same on all architectures but alpha
+_WORTH_KB = 256
+# Changed pages, those of relocated tables say, would come back as the file has them.
+_CHANGED = ("Private_Dirty:", "Shared_Dirty:", "Anonymous:")
+
+
+def cpu_s() -> float:
+    """Return the processor time of all threads so far."""
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
+
+
+def peak_resident_mb() -> float:
+    """Return the most memory that was resident, MiB.
+
+    Not ``ru_maxrss``, where the kernel tells: that one survives exec, so that a
+    small process started by a large one claims the large one's.
+    """
+    with suppress(OSError, ValueError):
+        for line in _STATUS.read_text(encoding="ascii").splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def give_back() -> None:
+    """Give back memory that is not needed now: freed blocks, pages that files still have.
+
+    The compiler is a hundred megabytes of libraries, read while compiled code is loaded and
+    hardly again. What is touched again is read again. Nothing happens where the system
+    knows no such thing.
+    """
+    with suppress(OSError, AttributeError, ValueError):
+        libc = ctypes.CDLL(None)
+        libc.malloc_trim(ctypes.c_size_t(0))
+        for begin, end in list(_unchanged_file_pages(_MAPS.read_text(encoding="utf-8"))):
+            libc.madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), _MADV_DONTNEED)
+
+
+def _unchanged_file_pages(maps: str) -> Iterator[tuple[int, int]]:
+    """Yield begin and end of mapped files that nobody can write to nor has changed.
+
+    Args:
+        maps: as of ``/proc/PID/smaps``: a line "begin-end rights offset device inode path" for
+            each mapping, then lines "Key: value kB".
+    """
+    begin = end = 0
+    is_file, kb = False, dict[str, int]()
+    for line in maps.splitlines():
+        first, *rest = line.split()
+        if not first.endswith(":"):
+            begin, end = (int(address, 16) for address in first.split("-"))
+            is_file = len(rest) > 4 and rest[4].startswith("/") and "w" not in rest[0]
+            kb = {}
+        elif first != "VmFlags:":
+            kb[first] = int(rest[0])
+        elif is_file and kb["Rss:"] > _WORTH_KB and not any(kb.get(key, 1) for key in _CHANGED):
+            yield begin, end
