@@ -15,6 +15,7 @@ from vcl_companion.vision.bundle import (
     adjust,
     linearized,
     normal_equations,
+    point_information,
     reprojection_residuals,
     residual_noise_px,
 )
@@ -181,6 +182,30 @@ def test_noise_gives_errors_as_large_as_the_covariance(n_views: int) -> None:
         )
         covariances.append(joint_covariance(found, scene.noise_px))
     assert_consistent(errors, np.array(covariances))
+
+
+@pytest.mark.parametrize("n_held", [2, 3])
+def test_held_views_stay_and_the_others_find_their_place(n_held: int) -> None:
+    rng = np.random.default_rng(11)
+    scene = facade_scene(rng, 80, 4.0, n_views=4)
+    truth = truth_of(scene)
+    bodies = tuple(
+        body if i < n_held else body.retracted(0.02 * rng.standard_normal(6))
+        for i, body in enumerate(truth.bodies)
+    )
+    points = truth.points + 0.05 * rng.standard_normal(truth.points.shape)
+    start = replace(truth, bodies=bodies, points=points, n_held=n_held)
+    adjusted, _ = adjust(start, BundleOptions())
+    for i in range(4):
+        if i < n_held:
+            assert adjusted.bodies[i] is bodies[i]
+        assert_pose_close(adjusted.bodies[i], truth.bodies[i], within_m=1e-5, within_rad=1e-6)
+    np.testing.assert_allclose(adjusted.points, truth.points, atol=1e-4)
+    np.testing.assert_allclose(
+        np.linalg.inv(point_information(truth)),
+        np.linalg.inv(normal_equations(truth, None).point_block),
+        rtol=1e-6,
+    )
 
 
 def test_wrong_matches_pull_little() -> None:

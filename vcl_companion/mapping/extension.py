@@ -40,7 +40,9 @@ ImageFeatures = Callable[[bytes, Camera, Detector], Features]
 _PARTNERS = 3
 _AGAIN = AlignRules(max_iterations=15, least_score=0.85, max_moved_px=1.5, settled_px=0.02)
 _RELATIVE_SIGMA = 0.02
-_STEPS = (8, 12)
+_STEPS, _LEAST_GAIN = (8, 12), (1e-3, 1e-4)
+# Old keyframes that an extension may still move.
+_NEAREST = 9
 _CAUCHY_PX = 0.5
 # Residuals of patches that are the same spot: first loosely, by poses not adjusted yet.
 _LIMIT_PX = (1.5, 0.5)
@@ -213,16 +215,13 @@ class Extension:
         limit_px = max(_LIMIT_PX[turn], _MAX_SIGMAS * self._old.pixel_noise_px)
         fits, good = fitting(views, 2.0 * limit_px, self._options)
         views = replace(views, ideal=np.where(fits[..., None], ideal, np.nan))
-        adjusted, noise_px = adjust(
-            _of(views, good), BundleOptions(_STEPS[turn], _CAUCHY_PX, least_gain=1e-5)
+        views, noise_px = _adjusted_near(
+            views, good, self._n_keys, BundleOptions(_STEPS[turn], _CAUCHY_PX, _LEAST_GAIN[turn])
         )
-        points = views.points.copy()
-        points[good] = adjusted.points
-        views = replace(views, bodies=adjusted.bodies, points=points)
         fits, again = fitting(views, max(_LIMIT_PX[turn], _MAX_SIGMAS * noise_px), self._options)
         observed = np.where(fits[..., None], table.observed, np.nan)
         return (
-            replace(table, observed=observed, points=points, bodies=adjusted.bodies),
+            replace(table, observed=observed, points=views.points, bodies=views.bodies),
             good & again,
             noise_px,
         )
@@ -302,7 +301,44 @@ def _seen_px(observed: Array, column: int) -> Array:
     return np.asarray(pixels[np.isfinite(pixels[:, 0])])
 
 
-def _of(views: Views, good: Mask) -> Views:
-    return replace(
-        views, slopes=views.slopes[good], ideal=views.ideal[good], points=views.points[good]
+def _adjusted_near(
+    views: Views, good: Mask, n_keys: int, options: BundleOptions
+) -> tuple[Views, float]:
+    """Adjust the new views, the old keyframes that share most with them, and what these see.
+
+    Farther keyframes are held where they are: what they could still learn is little, and
+    the cost of an extension does not grow with the map.
+
+    Args:
+        views: of which the first ``n_keys`` are old.
+        good: (N,) landmarks to be used.
+        n_keys: see above.
+        options: of the adjustment.
+
+    Returns:
+        All views with what was adjusted, and the noise of its observations, px.
+    """
+    seen = np.asarray(np.isfinite(views.ideal[:, :, 0]) & good[:, None])
+    shown = np.any(seen[:, n_keys:], axis=1)
+    shared = seen[shown, :n_keys].sum(axis=0)
+    moving = np.zeros(len(views.bodies), dtype=bool)
+    moving[n_keys:] = True
+    moving[np.argsort(-shared, kind="stable")[:_NEAREST]] = True
+    moving[0] = False
+    order = np.argsort(moving, kind="stable")
+    place = np.argsort(order)
+    rows = np.flatnonzero((seen & moving).any(axis=1))
+    part = Views(
+        bodies=tuple(views.bodies[i] for i in order),
+        mountings=tuple(views.mountings[i] for i in order),
+        slopes=views.slopes[rows][:, order],
+        ideal=views.ideal[rows][:, order],
+        points=views.points[rows],
+        distances=tuple(replace(d, a=int(place[d.a]), b=int(place[d.b])) for d in views.distances),
+        n_held=int(np.sum(~moving)),
     )
+    adjusted, noise_px = adjust(part, options)
+    points = views.points.copy()
+    points[rows] = adjusted.points
+    bodies = tuple(adjusted.bodies[place[i]] for i in range(len(order)))
+    return replace(views, bodies=bodies, points=points), noise_px

@@ -35,13 +35,14 @@ class Views:
     """What was seen from where.
 
     Attributes:
-        bodies: V world_from_body poses; the first is held fixed.
+        bodies: V world_from_body poses; the first ones are held fixed.
         mountings: V body_from_cam poses.
         slopes: (N, V, 2, 2) d(pixel) / d(ideal) at the observations, by which
             residuals are in pixels of the raw image, where the noise is the same everywhere.
         ideal: (N, V, 2) observations as ideal image coordinates x/z, y/z; NaN where unseen.
         points: (N, 3) landmarks, world frame, m.
         distances: what fixes the scale.
+        n_held: how many poses are held fixed, at least one.
     """
 
     bodies: tuple[Pose, ...]
@@ -50,6 +51,7 @@ class Views:
     ideal: Array
     points: Array
     distances: tuple[Distance, ...]
+    n_held: int = 1
 
 
 @dataclass(frozen=True)
@@ -163,6 +165,7 @@ class _Problem:
         self._ideal = np.ascontiguousarray(views.ideal[seen])
         self._mountings = _matrices(views.mountings)
         self._cauchy_px = cauchy_px
+        self._n_held = views.n_held
 
     def cost(self, views: Views) -> float:
         """Return the robust cost, px^2 (distances weighted to the same unit)."""
@@ -171,7 +174,8 @@ class _Problem:
 
     def system(self, views: Views, damping: float) -> _System:
         """Linearise at an estimate."""
-        system = _System(*kernels.reduced(*self.arguments(views), self._cauchy_px, damping))
+        found = kernels.reduced(*self.arguments(views), self._cauchy_px, damping, self._n_held)
+        system = _System(*found)
         before = np.diag(system.normal).copy()
         for known in views.distances:
             _add_distance(views, known, system.normal, system.rhs)
@@ -179,7 +183,7 @@ class _Problem:
 
     def step(self, system: _System, damping: float) -> tuple[Array, Array] | None:
         """Return the damped (6V,) pose step and (N, 3) point step; None where singular."""
-        free = slice(6, len(system.rhs))
+        free = slice(6 * self._n_held, len(system.rhs))
         damped = system.normal[free, free] + damping * np.diag(system.diagonal[free])
         pose_step = np.zeros(len(system.rhs))
         try:
@@ -334,7 +338,7 @@ def _add_distance(
 
 def _moved(views: Views, pose_step: Array, point_step: Array) -> Views:
     bodies = tuple(
-        body.retracted(pose_step[6 * i : 6 * i + 6]) if i else body
+        body.retracted(pose_step[6 * i : 6 * i + 6]) if i >= views.n_held else body
         for i, body in enumerate(views.bodies)
     )
     return replace(views, bodies=bodies, points=views.points + point_step)

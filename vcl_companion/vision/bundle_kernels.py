@@ -131,6 +131,7 @@ def reduced(
     ideal: Array,
     cauchy_px: float,
     damping: float,
+    n_held: int,
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Linearise every observation and eliminate the landmarks.
 
@@ -144,6 +145,7 @@ def reduced(
         ideal: (M, 2).
         cauchy_px: robust scale.
         damping: of the landmarks' own blocks, relative.
+        n_held: so many of the first bodies do not move; their rows stay zero.
 
     Returns:
         (6V, 6V) reduced normal matrix, (6V,) its right side, (6V,) the poses' own
@@ -167,6 +169,8 @@ def reduced(
             weight = 1.0 / (1.0 + squared / cauchy_px**2)
             a = 6 * i
             for r in range(6):
+                if i < n_held:
+                    break
                 wr0, wr1 = weight * j_pose[0, r], weight * j_pose[1, r]
                 rhs[a + r] -= wr0 * residual[0] + wr1 * residual[1]
                 for c in range(6):
@@ -184,6 +188,8 @@ def reduced(
         inverse = inverses[j]
         _invert(block, inverse)
         for m in range(first[j], first[j + 1]):
+            if view[m] < n_held:
+                continue
             a = 6 * view[m]
             for r in range(6):
                 for c in range(3):
@@ -196,6 +202,8 @@ def reduced(
                     left[r, 0] * pulls[j, 0] + left[r, 1] * pulls[j, 1] + left[r, 2] * pulls[j, 2]
                 )
             for n in range(first[j], m + 1):
+                if view[n] < n_held:
+                    continue
                 b = 6 * view[n]
                 for r in range(6):
                     for c in range(6):
