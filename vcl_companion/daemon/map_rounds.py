@@ -214,7 +214,10 @@ class MapRounds:
             described = [await self._describe(f, self._gathering.request_id) for f in own]
         except ValueError as error:
             return NoMap(f"our own frame: {error}")
-        return described + await self._gathering.gather(wanted, is_over)
+        began_s = self._now_s()
+        gathered = described + await self._gathering.gather(wanted, is_over)
+        _log.info("%d frames gathered in %.1f s", len(gathered), self._now_s() - began_s)
+        return gathered
 
     async def _built(
         self,
@@ -224,8 +227,11 @@ class MapRounds:
         if isinstance(frames, NoMap):
             return frames
         loop = asyncio.get_running_loop()
+        began_s = self._now_s()
         try:
-            return await loop.run_in_executor(self._executor, build, frames)
+            built = await loop.run_in_executor(self._executor, build, frames)
+            _log.info("%d frames built into a map in %.1f s", len(frames), self._now_s() - began_s)
+            return built
         except Exception as error:
             # Peers' images and numbers went in: none of them may end the flight.
             _log.exception("a map cannot be built")
