@@ -9,6 +9,7 @@ from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.templates import Templates, prepare_templates
+from vcl_companion.mapping.uncertainty import MapUncertainty
 from vcl_companion.vision.features import Detector, FeatureOptions, Features
 from vcl_companion.wire.header import BlobKind
 from vcl_companion.wire.map_codec import decode_map, parent_of, revision_of
@@ -56,7 +57,7 @@ class ReadyMap:
 def ready_map(
     offer: MapOffer,
     current: StoredMap | None,
-    detectors: tuple[Detector, ...],
+    detector: Detector,
     features: FeatureOptions,
     memory: FeatureMemory,
     tracked: bool,
@@ -66,7 +67,7 @@ def ready_map(
     Args:
         offer: what came or was made.
         current: the map in use, perhaps its parent.
-        detectors: the localization's own, and what it falls back on.
+        detector: the localization's own.
         features: how they are found.
         memory: finds them.
         tracked: whether the map is also made ready to be tracked.
@@ -84,38 +85,41 @@ def ready_map(
     else:
         data, update = decode_map_update(offer.blob, parent), offer.blob
 
-    landmark_map = decode_map(data)
-    index = _indexed(landmark_map, detectors, features, memory)
+    index = _indexed(decode_map(data), detector, features, memory)
     if parent is not None and not update:
         update = encode_map_update(data, parent)
     templates = prepare_templates(index.landmark_map, index.uncertainty) if tracked else None
     return ReadyMap(data, index, update, templates)
 
 
-def _indexed(
-    landmark_map: LandmarkMap,
+def with_fallbacks(
+    index: MapIndex,
     detectors: tuple[Detector, ...],
     features: FeatureOptions,
     memory: FeatureMemory,
 ) -> MapIndex:
-    """Make a map ready to be recognised by the first detector, and after that by the others.
+    """Return a map's index that falls back on other detectors, in this order.
 
-    Raises:
-        ValueError: the first one finds nothing of it, or it is not determined.
+    One that finds nothing of the map is left out.
     """
-    index: MapIndex | None = None
+    fallback: MapIndex | None = None
     for detector in reversed(detectors):
-
-        def features_of(keyframe: Keyframe, detector: Detector = detector) -> Features:
-            return memory.features(keyframe.image_bytes, keyframe.camera, detector)
-
-        uncertainty = None if index is None else index.uncertainty
         try:
-            found = index_map(landmark_map, detector, features, features_of, uncertainty)
+            found = _indexed(index.landmark_map, detector, features, memory, index.uncertainty)
         except ValueError:
-            if detector == detectors[0]:
-                raise
             continue
-        index = replace(found, fallback=index)
-    assert index is not None
-    return index
+        fallback = replace(found, fallback=fallback)
+    return replace(index, fallback=fallback)
+
+
+def _indexed(
+    landmark_map: LandmarkMap,
+    detector: Detector,
+    features: FeatureOptions,
+    memory: FeatureMemory,
+    uncertainty: MapUncertainty | None = None,
+) -> MapIndex:
+    def features_of(keyframe: Keyframe) -> Features:
+        return memory.features(keyframe.image_bytes, keyframe.camera, detector)
+
+    return index_map(landmark_map, detector, features, features_of, uncertainty)

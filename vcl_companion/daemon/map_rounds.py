@@ -199,7 +199,7 @@ class MapRounds:
 
     def _is_past(self, stored: StoredMap) -> bool:
         """Whether a round that began with a map has come too late."""
-        return self._maps.current is not stored or not self._group.is_coordinator
+        return not self._maps.is_in_use(stored) or not self._group.is_coordinator
 
     async def _gathered(
         self, newest: Frame, wanted: Wanted, is_over: Callable[[], bool]

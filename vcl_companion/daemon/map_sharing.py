@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.mailbox import PeerMailbox
-from vcl_companion.daemon.map_offer import MapOffer, ReadyMap, ready_map
+from vcl_companion.daemon.map_offer import MapOffer, ReadyMap, ready_map, with_fallbacks
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.usage import give_back
 from vcl_companion.errors import WireError
@@ -160,7 +160,7 @@ class MapSharing:
         ready = await self._prepared(MapOffer.of(BlobKind.MAP, data))
         if isinstance(ready, NoMap):
             return ready
-        if self._maps.current is instead_of:
+        if self._maps.is_in_use(instead_of):
             await self._install(ready)
         return None
 
@@ -249,7 +249,7 @@ class MapSharing:
                 ready_map,
                 offer,
                 self._maps.current,
-                self._detectors,
+                self._detectors[0],
                 self._features,
                 self._memory,
                 self._tracked,
@@ -271,5 +271,15 @@ class MapSharing:
         self._tell_state()
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._executor, self._maps.keep, stored)
+        # Frames fly on it meanwhile: who is not lost does not need this, and it takes seconds.
+        index = await loop.run_in_executor(
+            self._executor,
+            with_fallbacks,
+            stored.index,
+            self._detectors[1:],
+            self._features,
+            self._memory,
+        )
+        self._maps.improve(stored, index)
         # Making it took a hundred megabytes more than it is.
         await loop.run_in_executor(self._executor, give_back)

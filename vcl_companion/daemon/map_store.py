@@ -8,7 +8,7 @@ import os
 import tempfile
 from collections import deque
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vcl_companion.errors import ConfigError
@@ -96,6 +96,18 @@ class MapStore:
         self._decided.set()
         return stored
 
+    def improve(self, stored: StoredMap, index: MapIndex) -> None:
+        """Recognise a revision by a better index from the next frame on, if it is still in use."""
+        if self.current is stored:
+            self.current = replace(stored, index=index)
+            self._decided.set()
+
+    def is_in_use(self, stored: StoredMap | None) -> bool:
+        """Whether we fly on a revision, or, for None, on no map at all."""
+        if self.current is None or stored is None:
+            return self.current is stored
+        return self.current.revision == stored.revision
+
     def has_left(self, revision: bytes) -> bool:
         """Whether a revision was in use here, or is the one that ours was made from."""
         current = self.current
@@ -117,7 +129,7 @@ class MapStore:
         return self.current
 
     async def newer_than(self, stored: StoredMap) -> None:
-        """Wait until another map than this one is in use."""
+        """Wait until another map than this one is in use, or a better index of it."""
         while self.current is stored:
             self._decided.clear()
             await self._decided.wait()
