@@ -66,9 +66,9 @@ _SCORE_NOTE = (
 )
 _RELIANCE_NOTE = (
     "Of each frame: the map, recognised by its patches or, at the start and when lost, by "
-    "features; a peer that told where we were; attitude and motion since the last of these, for "
-    "a short while (such a frame counts as refused); or nothing. A tick: a peer's word was "
-    "fused as well. Share of the frames in the table."
+    "features; a peer that told where we were; attitude and motion since the last of these, where "
+    "filter.coast_s allows it (such a frame counts as refused); or nothing. A tick: a peer's word "
+    "was fused as well. Share of the frames in the table."
 )
 _SOURCE_NOTE = (
     "Share of the frames whose pose came from the frame's own landmarks (intra), from a peer that "

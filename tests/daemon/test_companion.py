@@ -111,7 +111,9 @@ def nobody_to_ask(executor: ThreadPoolExecutor, clock: ManualClock) -> InterTarg
 
 
 @contextlib.asynccontextmanager
-async def flight(path: Path, frame_wait_s: float = 0.1) -> AsyncIterator[Flight]:
+async def flight(
+    path: Path, frame_wait_s: float = 0.1, coast_s: float = 0.0
+) -> AsyncIterator[Flight]:
     """A companion with everything around it; its own two coroutines do not run yet."""
     first = demo.shot(DRONE)
     clock = ManualClock(first.at_ns)
@@ -131,7 +133,8 @@ async def flight(path: Path, frame_wait_s: float = 0.1) -> AsyncIterator[Flight]
         maps, history = MapStore(""), FrameHistory()
         health = Health(link, log)
         outcomes = FrameOutcomes(camera, clock, health, log)
-        estimator = Estimator(FilterOptions(), OPTIONS.localization, lambda _: None)
+        motion = FilterOptions(coast_s=coast_s)
+        estimator = Estimator(motion, OPTIONS.localization, lambda _: None)
         companion = Companion(
             camera, outcomes, sensor, link, maps, estimator, nobody_to_ask(executor, clock),
             history.add, health, log, executor, OPTIONS, frame_wait_s,
@@ -154,10 +157,12 @@ async def flight(path: Path, frame_wait_s: float = 0.1) -> AsyncIterator[Flight]
 
 
 @contextlib.asynccontextmanager
-async def flying(path: Path, frame_wait_s: float = 0.1) -> AsyncIterator[Flight]:
+async def flying(
+    path: Path, frame_wait_s: float = 0.1, coast_s: float = 0.0
+) -> AsyncIterator[Flight]:
     """The same, in flight."""
     async with (
-        flight(path, frame_wait_s) as up,
+        flight(path, frame_wait_s, coast_s) as up,
         beside(up.companion.read_camera(), up.companion.run()),
     ):
         await up.server.connected()
@@ -356,7 +361,7 @@ def test_frames_that_show_nothing_are_bridged_by_attitude_and_motion_for_a_while
     """Less and less certain; then nothing is sent, then a fix again."""
 
     async def scenario() -> None:
-        async with flying(tmp_path) as up:
+        async with flying(tmp_path, coast_s=1.0) as up:
             up.fly_on_a_map()
             fog, shows = demo.png(demo.blank(DRONE)), [*range(6), 11]
             for k in range(12):
@@ -384,6 +389,24 @@ def test_frames_that_show_nothing_are_bridged_by_attitude_and_motion_for_a_while
             assert sigmas[-1] < LocalizationOptions().max_sigma_m
             assert (await up.autopilot.poses.get())[0] == demo.shot(DRONE, 11).at_ns // 1000
             assert bases[11] == "patches"
+
+    run(scenario())
+
+
+def test_what_nobody_has_measured_is_not_sent_unless_that_is_wanted(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            fog = demo.png(demo.blank(DRONE))
+            for k in range(6):
+                if k == 4:
+                    up.give_image(k, fog)
+                else:
+                    up.give(k)
+                await up.server.answered()
+            assert up.bases() == ["patches"] * 4 + [None, "patches"]
+            times = [(await up.autopilot.poses.get())[0] for _ in range(5)]
+            assert times == [demo.shot(DRONE, k).at_ns // 1000 for k in (0, 1, 2, 3, 5)]
 
     run(scenario())
 

@@ -27,7 +27,7 @@ from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.vision.features import FeatureOptions
 
 OPTIONS = PipelineOptions(FeatureOptions(), LocalizationOptions(), TrackingOptions())
-MOTION = FilterOptions()
+MOTION = FilterOptions(coast_s=1.0)
 PER_S, LENGTH_S = 10, 5.4
 # Turned by 160 degrees in 1.6 s, for 0.8 s, and back.
 LEAVES_S, TURNS_S, RETURNS_S = 0.8, 1.6, 3.2

@@ -22,6 +22,7 @@ from vcl_companion.vision.resection import (
     Resection,
     ResectionOptions,
     Sightings,
+    Undecided,
     refine,
     search,
 )
@@ -211,6 +212,23 @@ def test_one_landmark_off_a_flat_scene_does_not_decide(shift_px: float) -> None:
         covariances.append(result.noise_covariance)
     assert float(np.sqrt(np.trace(covariances[0][:3, :3]))) > 0.3  # honest: hardly known without it
     assert_consistent(errors, np.array(covariances), slack=1.5)  # far from linear
+
+
+def test_what_does_not_stand_without_one_landmark_is_undecided_and_says_where_it_would_be() -> None:
+    sightings, truth = flat_scene_with_one_landmark_off_it(np.random.default_rng(3), 0.0)
+    last = np.r_[:14, 60]
+    few = replace(
+        sightings, ideal=sightings.ideal[last], points=sightings.points[last],
+        point_covariances=sightings.point_covariances[last], bias_px=sightings.bias_px[last],
+        slopes=sightings.slopes[last],
+    )  # fmt: skip
+    result = refine(truth, few, OPTIONS)
+    assert isinstance(result, Undecided)
+    assert result.reason == "14 landmarks left, 15 needed"
+    error = truth.local(result.found.world_from_body)
+    assert np.linalg.norm(error[:3]) < 4.0 * np.sqrt(
+        np.trace(result.found.noise_covariance[:3, :3])
+    )
 
 
 def test_few_landmarks_are_refused_with_a_reason() -> None:

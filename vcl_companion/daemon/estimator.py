@@ -118,7 +118,7 @@ class Estimator:
         state = self._history.at(at_ns)
         if state is None or state.ned_from_body is None or self._n_contradicted:
             return None
-        if at_ns - state.fixed_at_ns > self._options.coast_s * 1e9:
+        if not 0 < at_ns - state.fixed_at_ns <= self._options.coast_s * 1e9:
             return None
         variances = np.linalg.eigvalsh(state.pose_covariance()[:3, :3])
         return state if variances[-1] <= self._localization.max_sigma_m**2 else None

@@ -46,7 +46,7 @@ class FilterOptions:
         attitude_turn_error: change of that offset as a share of the angle turned, 1 sigma.
         turn_rate_deg_s: unknown rotation when the autopilot sends no attitude, 1 sigma.
         coast_s: how long after the last fix a pose by attitude and motion alone is
-            still sent; 0: never.
+            still sent; 0: never, for nobody has measured it.
     """
 
     acceleration_m_s2: float = 3.0
@@ -55,7 +55,7 @@ class FilterOptions:
     attitude_drift_deg_s: float = 0.1
     attitude_turn_error: float = 0.02
     turn_rate_deg_s: float = 45.0
-    coast_s: float = 1.0
+    coast_s: float = 0.0
 
     def __post_init__(self) -> None:
         for name in (
