@@ -29,6 +29,8 @@ MAPPING = MapOptions()
 
 # What a prediction is off between frames, 1 sigma: a filter's in fast flight, or a bit worse.
 _PREDICTION = np.array([0.03] * 3 + [np.deg2rad(0.3)] * 3)
+# What a drone believes of a frame that it has localized is off, 1 sigma.
+_BELIEVED = _PREDICTION / 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +68,10 @@ class Shot:
         if detected:
             image = decode_image(sent, self.camera)
             features = tuple(detect(image, name, FEATURES) for name in MAPPING.detectors)
-        guess = None if detected else self.predicted(np.random.default_rng(at_ns)).world_from_body
+        guess = None
+        if not detected:
+            rng = np.random.default_rng([at_ns, self.drone_id])
+            guess = self.world_from_body.retracted(_BELIEVED * rng.standard_normal(6))
         return DroneView(
             self.drone_id, at_ns, self.camera, self.body_from_cam,
             self.world_from_body.rotation, sent, features, guess,

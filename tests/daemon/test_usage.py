@@ -15,7 +15,7 @@ _TELL = "from vcl_companion.daemon.usage import peak_resident_mb as p; print(p()
 _GIVES_BACK = """
 import numba, cv2, numpy as np
 from pathlib import Path
-from vcl_companion.daemon.usage import give_back
+from vcl_companion.daemon.usage import give_back_files
 
 def resident():
     lines = Path("/proc/self/status").read_text().splitlines()
@@ -24,7 +24,7 @@ def resident():
 values = np.random.default_rng(0).standard_normal((64, 64))
 numba.njit(lambda x: x + 1)(1)
 found = [resident(), None, np.linalg.inv(values).sum(), None]
-give_back()
+give_back_files()
 found[1] = resident()
 found[3] = np.linalg.inv(values).sum()
 print(*found)

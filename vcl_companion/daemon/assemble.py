@@ -27,7 +27,7 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
-from vcl_companion.daemon.usage import cpu_s, give_back, peak_resident_mb
+from vcl_companion.daemon.usage import cpu_s, give_back_files, give_back_freed, peak_resident_mb
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.errors import VclError
 from vcl_companion.links.autopilot import AutopilotLink
@@ -113,7 +113,8 @@ async def _run(config: Config) -> int:
     # a tenth of a second and the interpreter's lock.
     gc.collect()
     gc.freeze()
-    give_back()
+    give_back_freed()
+    give_back_files()
     rng = np.random.default_rng()
     exchange = Exchange(
         config.system_id,

@@ -18,7 +18,7 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.mailbox import PeerMailbox
 from vcl_companion.daemon.map_offer import MapOffer, ReadyMap, ready_map, with_fallbacks
 from vcl_companion.daemon.map_store import MapStore, StoredMap
-from vcl_companion.daemon.usage import give_back
+from vcl_companion.daemon.usage import give_back_freed
 from vcl_companion.errors import WireError
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import NoMap
@@ -282,4 +282,4 @@ class MapSharing:
         )
         self._maps.improve(stored, index)
         # Making it took a hundred megabytes more than it is.
-        await loop.run_in_executor(self._executor, give_back)
+        await loop.run_in_executor(self._executor, give_back_freed)

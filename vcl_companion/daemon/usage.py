@@ -35,16 +35,20 @@ def peak_resident_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def give_back() -> None:
-    """Give back memory that is not needed now: freed blocks, pages that files still have.
+def give_back_freed() -> None:
+    """Give blocks that were freed back to the system, where it knows how to (glibc)."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(ctypes.c_size_t(0))
+
+
+def give_back_files() -> None:
+    """Give up pages that files still have; what is touched again is mapped again.
 
     The compiler is a hundred megabytes of libraries, read while compiled code is loaded and
-    hardly again. What is touched again is read again. Nothing happens where the system
-    knows no such thing.
+    hardly again. Nothing happens where the system knows no such thing.
     """
     with suppress(OSError, AttributeError, ValueError):
         libc = ctypes.CDLL(None)
-        libc.malloc_trim(ctypes.c_size_t(0))
         for begin, end in list(_unchanged_file_pages(_MAPS.read_text(encoding="utf-8"))):
             libc.madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), _MADV_DONTNEED)
 

@@ -8,6 +8,7 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
+from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Any, ParamSpec, TypeVar
 
@@ -72,7 +73,10 @@ class Worker(Executor):
 
     def _run(self) -> None:
         if self._yields and sys.platform == "linux":
-            os.setpriority(os.PRIO_PROCESS, 0, os.getpriority(os.PRIO_PROCESS, 0) + self._yields)
+            # A sandbox may forbid it; the work is done all the same.
+            with suppress(OSError):
+                niceness = os.getpriority(os.PRIO_PROCESS, 0) + self._yields
+                os.setpriority(os.PRIO_PROCESS, 0, niceness)
         while (work := self._queue.get()) is not None:
             future, do = work
             if not future.set_running_or_notify_cancel():

@@ -127,9 +127,11 @@ def sampled(texels: Texels, start: int, height: int, width: int, u: float, v: fl
     """Return the grey level at a pixel of one pyramid level, bilinear; the caller keeps inside."""
     column, row = int(u), int(v)
     a, b = u - column, v - row
-    at = start + row * width + column
-    top = texels[at] * (1.0 - a) + texels[at + 1] * a
-    bottom = texels[at + width] * (1.0 - a) + texels[at + width + 1] * a
+    # Not signed: numba looks out for negative positions otherwise.
+    at, one = np.uint64(start + row * width + column), np.uint64(1)
+    below = at + np.uint64(width)
+    top = texels[at] * (1.0 - a) + texels[at + one] * a
+    bottom = texels[below] * (1.0 - a) + texels[below + one] * a
     return float(top * (1.0 - b) + bottom * b)
 
 
@@ -520,13 +522,10 @@ def align(
             smoothed = w00 * w00 + w01 * w01 + w10 * w10 + w11 * w11
             for r in range(SIDE):
                 at = start + (row + r - HALF) * width + column - HALF
+                # From zero on: numba looks out for negative positions otherwise.
+                top, bottom = image[at : at + SIDE + 1], image[at + width : at + width + SIDE + 1]
                 for c in range(SIDE):
-                    grey = (
-                        w00 * image[at + c]
-                        + w01 * image[at + c + 1]
-                        + w10 * image[at + width + c]
-                        + w11 * image[at + width + c + 1]
-                    )
+                    grey = w00 * top[c] + w01 * top[c + 1] + w10 * bottom[c] + w11 * bottom[c + 1]
                     s += grey
                     s2 += grey * grey
                     st += grey * basis[0, r, c]
@@ -623,8 +622,9 @@ def _searched(
             st = 0.0
             for r in range(SIDE):
                 at = start + (centre_v + r - HALF) * width + centre_u - HALF
+                line = image[at : at + SIDE]
                 for c in range(SIDE):
-                    grey = int(image[at + c])
+                    grey = int(line[c])
                     s += grey
                     s2 += grey * grey
                     st += grey * patch[r, c]

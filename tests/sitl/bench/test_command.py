@@ -48,15 +48,37 @@ def test_robust_runs_and_tells_whether_the_goal_is_met(tmp_path: Path) -> None:
     assert again.stdout.splitlines()[0] == f"{n}/{n} robust"
 
 
+def test_three_daemons_in_real_time_are_told_of_each(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "sitl", "bench", "realtime", "--quick", "--out", tmp_path],
+        cwd=ROOT, capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "realtime.json").read_text(encoding="utf-8"))
+    assert list(report["daemons"]) == ["mav0", "mav1", "mav2"]
+    for figures in report["daemons"].values():
+        found = {figure["name"]: figure["value"] for figure in figures}
+        assert found["frames"] == 23
+        assert 0.0 < found["localized"] <= 100.0 - found["dropped"] + 1e-9
+        assert 0.0 < found["capture to wire, p50"] <= found["capture to wire, p99"]
+        # The daemon's own, not the harness's, which holds the rendered town.
+        assert 100.0 < found["resident, most"] < 400.0
+        assert 0.0 < found["share of a core"] < 300.0
+    assert "| resident, most | " in (tmp_path / "realtime.md").read_text(encoding="utf-8")
+    assert (tmp_path / "recording-quick" / "recording.toml").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
         (["--only", "akaz"], "--only akaz means nothing; there is detect, match, match-map"),
         (["robust", "--only", "steps"], "--only steps means nothing; there is relative-planar-"),
         (["--seeds", "3"], "--seeds is for bench robust"),
+        (["speed", "--only", "fps"], "--only fps means nothing; there is frame, extension"),
+        (["realtime", "--only", "mav0"], "realtime has no parts"),
         (["--out", __file__], "is a file; give a folder"),
     ],
-    ids=["no step", "no cell", "seeds", "file"],
+    ids=["no step", "no cell", "seeds", "no part", "no parts", "file"],
 )
 def test_what_cannot_be_used_is_one_line(arguments: list[str], says: str, tmp_path: Path) -> None:
     done = CliRunner().invoke(main, ["bench", "--out", str(tmp_path), *arguments])
