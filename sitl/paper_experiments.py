@@ -86,7 +86,7 @@ EXPERIMENTS = (
         "1: turning in place between two perpendicular buildings",
         "rotate",
         ("mav0",),
-        tuned=(_EVERY_IMAGE, _NO_PAUSE),
+        tuned=(_NO_PAUSE, _EVERY_IMAGE),
     ),
     Experiment(
         "sparse", "2: one rich building, vertical flight of two targets", "sparse", ("mav1", "mav2")
