@@ -99,7 +99,7 @@ def painted_map(
     rng: np.random.Generator,
     camera: Camera = PINHOLE,
     n: int = 500,
-    noise_px: float = 0.25,
+    noise_px: float = 0.1,
     bodies: tuple[Pose, ...] = BODIES,
     recognisable: bool = False,
     scenery: Scenery = "boards",
@@ -108,7 +108,7 @@ def painted_map(
 
     With ``recognisable`` they are what a detector finds in the first one. Poses are
     true; a landmark lies on the truth up to its depth, which is as wrong as
-    ``noise_px`` in the keyframes leave it.
+    ``noise_px`` in the keyframes leave it: of patches, by default.
     """
     cams = [body @ MOUNTING for body in bodies]
     size = np.array([camera.width_px, camera.height_px])

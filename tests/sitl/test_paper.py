@@ -231,7 +231,7 @@ def test_the_way_is_that_of_the_truth(tmp_path: Path) -> None:
 def test_an_unfused_flight_stays_unfused_whatever_is_given() -> None:
     given = (Setting(("inter", "every_n_frames"), 3), Setting(("map", "min_landmarks"), 80))
     rotate = EXPERIMENT["rotate"]
-    assert settings_of(rotate, PIPELINE, True, ())[-1].value == 1
+    assert Setting(("inter", "every_n_frames"), 1) in settings_of(rotate, PIPELINE, True, ())
     assert settings_of(rotate, PIPELINE, True, given)[-2:] == given
     assert settings_of(rotate, PIPELINE, False, given)[-1] == NOT_FUSED
     once = {e.name for e in EXPERIMENTS if e.variants() == (True,)}

@@ -47,28 +47,40 @@ class PatchPoses:
         """Refine a pose that is right to a few sigmas of its patches."""
         return self._refined(found, pose, None, _NARROW)
 
-    def agreed(self, found: Alignment, pose: Pose) -> Pose | NotLocalized:
-        """Refine a pose that may be some px off, and return the one that most patches agree on.
+    def rivals(self, found: Alignment, pose: Pose) -> list[Pose] | NotLocalized:
+        """Refine a pose that may be some px off; where many patches disagree, in several ways.
 
         A thing that moves has patches that agree with each other, and when it is
         near or well seen they may draw the refinement to them. Where many disagree
         with what came out, every third of the image, upright and across, is left out
         in turn.
+
+        Returns:
+            The pose that most patches agree on, and after it those that mostly others
+            agree on.
         """
-        best = self.led(found, pose, None)
-        if isinstance(best, NotLocalized):
-            return best
-        most = self._n_agreeing(found, best)
-        if most >= _AGREED * len(found.anchors):
-            return best
+        first = self.led(found, pose, None)
+        if isinstance(first, NotLocalized):
+            return first
+        candidates = [(first, self._agreeing(found, first))]
+        if candidates[0][1].sum() >= _AGREED * len(found.anchors):
+            return [first]
         for part in self._without_a_third(found.pixels):
             other = self.led(found.of(part), pose, None)
-            if isinstance(other, NotLocalized):
-                continue
-            n = self._n_agreeing(found, other)
-            if n > most:
-                best, most = other, n
-        return best
+            if not isinstance(other, NotLocalized):
+                candidates.append((other, self._agreeing(found, other)))
+        candidates.sort(key=lambda one: -int(one[1].sum()))
+        kept: list[tuple[Pose, NDArray[np.bool_]]] = []
+        for candidate, agreeing in candidates:
+            n = int(agreeing.sum())
+            is_new = all((agreeing & others).sum() < 0.5 * n for _, others in kept)
+            if not kept or (is_new and n >= self.min_inliers):
+                kept.append((candidate, agreeing))
+        return [candidate for candidate, _ in kept]
+
+    def n_agreeing(self, found: Alignment, pose: Pose) -> int:
+        """Return how many patches agree with a pose."""
+        return int(self._agreeing(found, pose).sum())
 
     def support(
         self, found: Alignment, pose: Pose
@@ -76,8 +88,8 @@ class PatchPoses:
         """Return who agrees with a pose, and how they fix it (``pose_kernels.supported``)."""
         return supported(*self._system(pose, found), 2.0 * _CHI2_2_99)
 
-    def _n_agreeing(self, found: Alignment, pose: Pose) -> int:
-        return int(self.support(found, pose)[0].sum())
+    def _agreeing(self, found: Alignment, pose: Pose) -> NDArray[np.bool_]:
+        return np.asarray(self.support(found, pose)[0] > 0)
 
     def _without_a_third(self, pixels: Array) -> Iterator[NDArray[np.bool_]]:
         for axis in (0, 1):

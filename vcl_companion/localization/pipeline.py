@@ -32,7 +32,7 @@ Pipeline = Literal["default", "paper"]
 
 
 # Fewer than this share of the patches tried: they may be the ones that are wrong.
-_DOUBTFUL = 0.3
+_DOUBTFUL = 0.4
 # Share of the patches tried that must agree when what led to them was not to be believed.
 _LED_BY_A_VAGUE_POSE = 0.5
 

@@ -175,10 +175,20 @@ class _Tracker:
                 return coarse
             pose = coarse
         found = self._aligned(rows, pose, np.zeros(len(rows)), 0, options.least_score)
-        refined = self._poses.agreed(found, pose)
-        if isinstance(refined, NotLocalized):
-            return refined
-        if float(np.median(np.abs(found.pixels - found.predicted))) > _WELL_PREDICTED_PX:
+        rivals = self._poses.rivals(found, pose)
+        if isinstance(rivals, NotLocalized):
+            return rivals
+        refined = rivals[0]
+        if len(rivals) > 1:
+            # Found from where the wrong one is, patches are missing that are right for another.
+            looks = [
+                self._aligned(rows, rival, np.zeros(len(rows)), 0, options.least_score)
+                for rival in rivals
+            ]
+            numbers = [self._poses.n_agreeing(*one) for one in zip(looks, rivals, strict=True)]
+            best = int(np.argmax(numbers))
+            found, refined = looks[best], rivals[best]
+        elif float(np.median(np.abs(found.pixels - found.predicted))) > _WELL_PREDICTED_PX:
             found = self._aligned(rows, refined, np.zeros(len(rows)), 0, options.least_score)
         return self._judged(found, refined, len(rows), in_view, ned_from_body)
 

@@ -13,7 +13,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.vision import pose_kernels
 from vcl_companion.vision.absolute_pose import resect
-from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust
+from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust, point_information
 from vcl_companion.vision.features import Features
 from vcl_companion.vision.guided_pairs import match_epipolar
 from vcl_companion.vision.hamming import hamming_index, nearest_two
@@ -63,6 +63,7 @@ def _adjust(points: Array) -> None:
         distances=(Distance(0, 1, 1.0, 0.01),),
     )
     adjust(views, BundleOptions(max_iterations=2))
+    point_information(views)
     n = len(points)
     near = np.tile(np.arange(4, dtype=np.int64), (n, 1))
     depth, far = points[:, 2], np.ones((n, 4))
