@@ -105,7 +105,7 @@ class Drone:
         self.exchange = Exchange(
             system_id, self.group, Transfers(transfer, rng), self.maps,
             self.autopilot_link, demo.sensor(system_id), clock, self.log, executor,
-            self.estimator,
+            executor, self.estimator,
             ExchangeOptions(
                 swarm, demo.MAP_OPTIONS, update, demo.FEATURES, ("akaze",), inter, tracked=False
             ),

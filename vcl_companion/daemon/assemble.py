@@ -43,8 +43,9 @@ _log = logging.getLogger(__name__)
 # A device that does not let go must not keep the flight log from its summary.
 _CLOSE_S = 3.0
 _SWITCH_S = 0.0005
-# Niceness of map making above the frames'; with half of them each gets half of the machine's time.
-_MAPPING_YIELDS = 8
+# Niceness of map making above the frames', and of looking for peers' poses: with half of them
+# each would get half of the machine's time.
+_MAPPING_YIELDS, _HOSTING_YIELDS = 8, 12
 _END_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
@@ -99,8 +100,9 @@ async def _run(config: Config) -> int:
     # The paper's pipeline sends what it has measured, and nothing else.
     motion = config.filter if config.pipeline == "default" else replace(config.filter, coast_s=0.0)
     estimator = Estimator(motion, config.localization, lambda why: log.event("jump", why))
-    # Frames never wait for a map that is being built: one thread for each.
+    # Frames never wait for a map that is being built, nor maps for peers: one thread for each.
     vision, mapping = Worker("vision"), Worker("mapping", _MAPPING_YIELDS)
+    hosting = Worker("hosting", _HOSTING_YIELDS)
     # Before anybody is told that we are here: no frame has to wait for the compiler.
     notify.status("compiling, once on this machine")
     warm = loop.run_in_executor(vision, warm_up)
@@ -126,6 +128,7 @@ async def _run(config: Config) -> int:
         clock,
         log,
         mapping,
+        hosting,
         estimator,
         ExchangeOptions(
             config.swarm,
@@ -182,6 +185,7 @@ async def _run(config: Config) -> int:
             # What still runs is not waited for: an update takes seconds, and nobody wants it.
             vision.shutdown(wait=False, cancel_futures=True)
             mapping.shutdown(wait=False, cancel_futures=True)
+            hosting.shutdown(wait=False, cancel_futures=True)
             log.close(
                 cpu_s=cpu_s() - began_cpu_s,
                 wall_s=time.monotonic() - began_at_s,
@@ -189,7 +193,7 @@ async def _run(config: Config) -> int:
                 peer_bytes_sent=peers.counters.bytes_out,
                 peer_bytes_received=peers.counters.bytes_in,
             )
-    vision.exit_status = mapping.exit_status = 0
+    vision.exit_status = mapping.exit_status = hosting.exit_status = 0
     return 0
 
 

@@ -87,6 +87,7 @@ class Exchange:
         clock: time base of frames.
         log: told of maps and peers.
         executor: runs map building and indexing.
+        hosting: runs the search for peers' poses, so that no map waits for it.
         estimator: where this drone is, and whether it knows.
         options: of the steps.
         rng: numbers our requests.
@@ -103,6 +104,7 @@ class Exchange:
         clock: Clock,
         log: FlightLog,
         executor: Executor,
+        hosting: Executor,
         estimator: Estimator,
         options: ExchangeOptions,
         rng: np.random.Generator,
@@ -180,7 +182,7 @@ class Exchange:
             self._refusals.count,
             sensor,
             clock,
-            executor,
+            hosting,
             options.features,
             options.inter,
         )
