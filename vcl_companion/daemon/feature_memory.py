@@ -6,16 +6,26 @@ again and again; finding their features was half of an update's time.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import NDArray
 
 from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.drone_view import decode_image
 from vcl_companion.mapping.landmark_map import Keyframe
 from vcl_companion.vision.features import Detector, FeatureOptions, Features, detect
 from vcl_companion.vision.patches import Pyramid, pyramid_of
 
-# About one and a half megabytes each with AKAZE and SIFT; a map has at most two dozen.
+# Under a megabyte each with AKAZE and SIFT; a map has at most two dozen.
 _N_IMAGES = 40
+
+
+@dataclass(frozen=True, eq=False)
+class _Halved:
+    pixels: Array
+    descriptors: NDArray[np.float16]
 
 
 class FeatureMemory:
@@ -29,7 +39,7 @@ class FeatureMemory:
     def __init__(self, options: FeatureOptions, n_images: int = _N_IMAGES) -> None:
         self._options = options
         self._n_images = n_images
-        self._known: dict[tuple[bytes, int, int], dict[Detector, Features]] = {}
+        self._known: dict[tuple[bytes, int, int], dict[Detector, Features | _Halved]] = {}
         self._pyramids: dict[tuple[bytes, int, int], Pyramid] = {}
 
     def features(self, image_bytes: bytes, camera: Camera, detector: Detector) -> Features:
@@ -41,11 +51,12 @@ class FeatureMemory:
         key = (image_bytes, camera.width_px, camera.height_px)
         known = self._known.pop(key, {})
         if detector not in known:
-            known[detector] = detect(decode_image(image_bytes, camera), detector, self._options)
+            found = detect(decode_image(image_bytes, camera), detector, self._options)
+            known[detector] = _compact(found)
         self._known[key] = known  # the last one asked for is the last to go
         while len(self._known) > self._n_images:
             del self._known[next(iter(self._known))]
-        return known[detector]
+        return _unpacked(known[detector])
 
     def pyramid(self, image_bytes: bytes, camera: Camera) -> Pyramid:
         """Return an encoded image at all resolutions.
@@ -74,3 +85,16 @@ class FeatureMemory:
         except ValueError:
             nothing = np.zeros((1, 1), np.uint8)
             return tuple(detect(nothing, detector, self._options) for detector in detectors)
+
+
+def _compact(features: Features) -> Features | _Halved:
+    """Keep descriptors of numbers in half the bytes: to a thousandth is enough."""
+    if features.descriptors.dtype != np.float32:
+        return features
+    return _Halved(features.pixels, features.descriptors.astype(np.float16))
+
+
+def _unpacked(kept: Features | _Halved) -> Features:
+    if isinstance(kept, Features):
+        return kept
+    return Features(kept.pixels, kept.descriptors.astype(np.float32))
