@@ -27,7 +27,13 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
-from vcl_companion.daemon.usage import cpu_s, give_back_files, give_back_freed, peak_resident_mb
+from vcl_companion.daemon.usage import (
+    cpu_s,
+    give_back_files,
+    give_back_freed,
+    peak_resident_mb,
+    share_freed,
+)
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.errors import VclError
 from vcl_companion.links.autopilot import AutopilotLink
@@ -64,6 +70,7 @@ def run_daemon(config: Config) -> int:
     # One core per thing: several daemons may share a machine, and OpenCV's own
     # threads make features depend on their number.
     cv2.setNumThreads(1)
+    share_freed()
     # A frame takes the interpreter's lock some dozen times; whoever makes a map beside it
     # gives it up after so long.
     sys.setswitchinterval(_SWITCH_S)

@@ -12,6 +12,7 @@ _STATUS = Path("/proc/self/status")
 _MAPS = Path("/proc/self/smaps")
 _MADV_DONTNEED = 4  # <linux/mman.h>, the same on all architectures but alpha
 _WORTH_KB = 256
+_ARENA_MAX = -8  # <malloc.h>
 # Changed pages, those of relocated tables say, would come back as the file has them.
 _CHANGED = ("Private_Dirty:", "Shared_Dirty:", "Anonymous:")
 
@@ -33,6 +34,16 @@ def peak_resident_mb() -> float:
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) / 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def share_freed() -> None:
+    """Let threads use what others have freed (glibc); call it before there are any.
+
+    Otherwise each keeps what it needed most for itself, and making a map, recognising
+    a frame and answering a peer take a hundred megabytes one after the other.
+    """
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
 
 
 def give_back_freed() -> None:

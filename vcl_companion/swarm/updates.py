@@ -64,10 +64,10 @@ class UpdateOptions:
     tracked: int = 100
     # Beside its own keyframe a map is seen half as well again as from anywhere else, so half
     # of the most is two thirds of what is usual: it has to be early, for the same reason.
-    share: float = 0.5
-    covered: float = 0.6
-    sigma_m: float = 0.01
-    sigma_growth: float = 2.0
+    share: float = 0.6
+    covered: float = 0.7
+    sigma_m: float = 0.005
+    sigma_growth: float = 1.5
     hold_s: float = 0.5
     interval_s: float = 2.0
     gather_timeout_s: float = 5.0
