@@ -62,8 +62,8 @@ class UpdateOptions:
     # A round takes seconds, and in fast flight landmarks halve in five: after two halvings
     # there must still be more than localization needs (15).
     tracked: int = 100
-    # Beside its own keyframe a map is seen half as well again as from anywhere else, so half
-    # of the most is two thirds of what is usual: it has to be early, for the same reason.
+    # Beside its own keyframe a map is seen half as well again as from anywhere else, so this
+    # is little less than what is usual: it has to be early, for the same reason.
     share: float = 0.6
     covered: float = 0.7
     sigma_m: float = 0.005
@@ -159,7 +159,8 @@ class OwnVote:
         return self._wants
 
     def _is_little(self) -> bool:
-        lately = statistics.median(s.tracked for _, s in self._seen)
+        # Half of the window does not outvote the other half.
+        lately = statistics.median_high(s.tracked for _, s in self._seen)
         self._most = max(self._most, lately)
         return lately < max(self._options.tracked, self._options.share * self._most)
 
@@ -167,7 +168,7 @@ class OwnVote:
         known = [s.covered for _, s in self._seen if s.covered is not None]
         if not known:
             return False
-        lately = statistics.median(known)
+        lately = statistics.median_high(known)
         self._most_covered = max(self._most_covered, lately)
         return lately < min(self._options.covered, _STILL_COVERED * self._most_covered)
 
@@ -175,7 +176,7 @@ class OwnVote:
         known = [s.sigma_m for _, s in self._seen if s.sigma_m is not None]
         if not known:
             return False
-        lately_m = statistics.median(known)
+        lately_m = statistics.median_low(known)
         self._least_sigma_m = min(self._least_sigma_m, lately_m)
         growth = self._options.sigma_growth
         return lately_m > max(self._options.sigma_m, growth * self._least_sigma_m)
