@@ -50,6 +50,8 @@ class _JournalFormatter(logging.Formatter):
 
 def set_up_logging(options: LogOptions) -> None:
     """Send messages from ``options.level`` up to standard error, in journald's form under it."""
+    # The compiler tells of every instruction.
+    logging.getLogger("numba").setLevel(logging.WARNING)
     handler = logging.StreamHandler(sys.stderr)
     if "JOURNAL_STREAM" in os.environ:
         handler.setFormatter(_JournalFormatter("%(name)s: %(message)s"))

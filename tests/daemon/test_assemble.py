@@ -20,11 +20,18 @@ import pytest
 from sitl.daemon_config import toml_text
 from tests.daemon import demo
 from tests.daemon.swarm import free_ports
+from vcl_companion.mapping.warm_up import warm_up
 from vcl_companion.recording import Description, RecordingWriter
 
 ROOT = Path(__file__).parents[2]
 N_FRAMES = 4
 BOUND_S = 30.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled() -> None:
+    """Compile once, which takes a minute on a new machine: daemons load what that left."""
+    warm_up()
 
 
 @pytest.fixture(scope="module")
