@@ -350,7 +350,17 @@ def test_who_knows_its_place_twice_worse_than_at_best_votes() -> None:
     assert not judged([best] * 20 + [good] * 20)
 
 
+def test_a_view_from_a_new_place_is_a_reason() -> None:
+    known = Sight(PLENTY, novelty_deg=0.9 * OPTIONS.novelty_deg)
+    new = Sight(PLENTY, novelty_deg=1.1 * OPTIONS.novelty_deg)
+    assert not judged([known] * 40)
+    assert judged([known] * 20 + [new] * 20)
+    assert not judged([new] * 20 + [known] * 20)
+
+
 def test_the_reasons_for_a_vote_are_bounded() -> None:
+    with pytest.raises(ValueError, match="novelty_deg"):
+        UpdateOptions(novelty_deg=0.0)
     for covered in (-0.1, 1.0):
         with pytest.raises(ValueError, match="covered"):
             UpdateOptions(covered=covered)

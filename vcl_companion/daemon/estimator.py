@@ -66,6 +66,8 @@ class Estimator:
         """Landmarks of the map that the last frame showed; 0 when it was refused."""
         self.covered = 0.0
         """Share of the last frame that they filled; 0 when it was refused."""
+        self.novelty_deg = 0.0
+        """How differently they looked there from how they are remembered, degrees."""
 
     def is_localized(self, now_ns: int) -> bool:
         """Whether a frame of the last two seconds gave a pose, by a fix or by a proposal."""
@@ -104,7 +106,7 @@ class Estimator:
         self, predicted: FilterState | None, at_ns: int, ned_from_body: Array | None
     ) -> None:
         """Note a frame without a fix: a proposal may still come for its instant."""
-        self.tracked, self.covered = 0, 0.0
+        self.tracked, self.covered, self.novelty_deg = 0, 0.0, 0.0
         if predicted is not None:
             self._history.append(predicted, None, ned_from_body)
         self._note(at_ns)
@@ -157,6 +159,7 @@ class Estimator:
         self._n_contradicted = 0
         self._has_begun = True
         self.tracked, self.covered = fix.n_seen, fix.covered
+        self.novelty_deg = fix.novelty_deg
         self._history.append(state, fix, ned_from_body)
         self._note(at_ns)
         return state

@@ -326,7 +326,9 @@ class Exchange:
         seen = self._estimator
         sigma_m = seen.sigma_m if seen.tracked else None
         self._wants_update = self._vote.look(
-            stored.revision if stored else b"", Sight(seen.tracked, seen.covered, sigma_m), now_s
+            stored.revision if stored else b"",
+            Sight(seen.tracked, seen.covered, sigma_m, seen.novelty_deg),
+            now_s,
         )
         return self._wants_update != before
 

@@ -1,4 +1,4 @@
-"""How much of an image the map fills: what tells that a map is getting too small (IV-G)."""
+"""How much of an image the map fills, and how new the view is: whether the map suffices (IV-G)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,29 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.rotation import Array
 
 _COLUMNS, _ROWS = 8, 6
+# A patch bears a turn of so many degrees as well as being seen twice as large or small.
+_OCTAVE_DEG = 15.0
+
+
+def novelty_deg(points: Array, now: Array, then: Array) -> float:
+    """Return how differently landmarks look from here than from where they are remembered.
+
+    Args:
+        points: (M, 3) landmarks, world, m; M at least 1.
+        now: (3,) where the camera is.
+        then: (M, 3) where the camera was that remembers each.
+
+    Returns:
+        Median of the angle between the lines of sight, degrees, and of a step in size:
+        a doubling or halving of the distance counts like 15 degrees.
+    """
+    ray, before = points - now, points - then
+    length = np.maximum(np.linalg.norm(ray, axis=1), 1e-9)
+    length_then = np.maximum(np.linalg.norm(before, axis=1), 1e-9)
+    cosine = np.einsum("mi,mi->m", ray, before) / (length * length_then)
+    angle_deg = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    octaves = np.log2(length / length_then)
+    return float(np.median(np.hypot(angle_deg, _OCTAVE_DEG * octaves)))
 
 
 def covered_share(pixels: Array, camera: Camera) -> float:

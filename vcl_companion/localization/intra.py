@@ -107,6 +107,8 @@ class Localized:
         n_seen: landmarks of the map that this image shows, as far as can be told.
         covered: share of the image that they fill, 0 to 1.
         by: what was recognised.
+        novelty_deg: how differently they look from where they are remembered
+            (``coverage.novelty_deg``); 0 where nobody has looked.
     """
 
     world_from_body: Pose
@@ -121,6 +123,7 @@ class Localized:
     n_seen: int = 0
     covered: float = 0.0
     by: Recognised = "features"
+    novelty_deg: float = 0.0
 
     def covariance(self) -> Array:
         """Return (6, 6) the whole covariance of this pose alone, local."""

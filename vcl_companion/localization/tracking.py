@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.localization.coverage import covered_share
+from vcl_companion.localization.coverage import covered_share, novelty_deg
 from vcl_companion.localization.intra import (
     LocalizationOptions,
     Localized,
@@ -288,5 +288,14 @@ class _Tracker:
             round(in_view * n / n_tried),
             covered_share(found.pixels[agrees > 0], self._camera),
             "patches",
+            self._novelty_deg(found.anchors[agrees > 0], pose),
         )
         return believed(fix, ned_from_body, self._belief)
+
+    def _novelty_deg(self, anchors: NDArray[np.int64], pose: Pose) -> float:
+        centres = np.stack([p.translation for p in self._anchors.images.worlds_from_cams])
+        return novelty_deg(
+            self._anchors.points_world[anchors],
+            (pose @ self._mounting).translation,
+            centres[self._anchors.keyframe[anchors]],
+        )

@@ -6,6 +6,8 @@ update when one of these holds for the median of its last second:
 * landmarks in sight < max(``tracked``, ``share`` x most since this revision);
 * covered share of the image < min(``covered``, 0.8 x most since this revision):
   sky is never covered, and no reason to update again and again;
+* median novelty of what is seen > ``novelty_deg``: from a new place the map is still
+  recognised, and soon no more, and here it can be joined to what comes;
 * 1-sigma of the position > max(``sigma_m``, ``sigma_growth`` x least since this
   revision): what is known no better than that only gets worse, and is
   inherited by whatever is added to the map later.
@@ -42,6 +44,8 @@ class UpdateOptions:
         share: so does one that sees less than this share of the most that it
             has seen of this revision; 0 for both of them: maps stay as they are.
         covered: share of the image that the map has to fill.
+        novelty_deg: landmarks are seen from so far aside of where they are remembered, or as
+            much nearer or farther (``localization.coverage``), before the map is extended.
         sigma_m: positions better than this are good enough.
         sigma_growth: above that, a drone wants an update when its position is known
             so many times worse than it was at best on this revision.
@@ -66,6 +70,7 @@ class UpdateOptions:
     # is little less than what is usual: it has to be early, for the same reason.
     share: float = 0.6
     covered: float = 0.7
+    novelty_deg: float = 8.0
     sigma_m: float = 0.005
     sigma_growth: float = 1.5
     hold_s: float = 0.5
@@ -87,6 +92,7 @@ class UpdateOptions:
         if not self.sigma_growth > 1:
             raise ValueError(f"sigma_growth must be more than 1, got {self.sigma_growth}")
         for name in (
+            "novelty_deg",
             "sigma_m",
             "hold_s",
             "interval_s",
@@ -111,11 +117,13 @@ class Sight:
         tracked: landmarks of the map in sight, 0 without a pose.
         covered: share of the image that they fill; None where nobody has looked.
         sigma_m: of the position by them, in its worst direction; None without a pose.
+        novelty_deg: how differently they look from how they are remembered.
     """
 
     tracked: int
     covered: float | None = None
     sigma_m: float | None = None
+    novelty_deg: float = 0.0
 
 
 class OwnVote:
@@ -155,7 +163,9 @@ class OwnVote:
         if not revision or not (self._options.tracked or self._options.share):
             self._wants = False
         elif now_s - self._since_s >= _JUDGED_SHARE * _WINDOW_S:
-            self._wants = self._is_little() or self._is_narrow() or self._is_vague()
+            self._wants = (
+                self._is_little() or self._is_narrow() or self._is_vague() or self._is_new()
+            )
         return self._wants
 
     def _is_little(self) -> bool:
@@ -171,6 +181,10 @@ class OwnVote:
         lately = statistics.median_high(known)
         self._most_covered = max(self._most_covered, lately)
         return lately < min(self._options.covered, _STILL_COVERED * self._most_covered)
+
+    def _is_new(self) -> bool:
+        lately_deg = statistics.median_low(s.novelty_deg for _, s in self._seen)
+        return lately_deg > self._options.novelty_deg
 
     def _is_vague(self) -> bool:
         known = [s.sigma_m for _, s in self._seen if s.sigma_m is not None]
