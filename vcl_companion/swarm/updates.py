@@ -70,7 +70,7 @@ class UpdateOptions:
     # is little less than what is usual: it has to be early, for the same reason.
     share: float = 0.6
     covered: float = 0.7
-    novelty_deg: float = 8.0
+    novelty_deg: float = 5.0
     sigma_m: float = 0.005
     sigma_growth: float = 1.5
     hold_s: float = 0.5
