@@ -124,9 +124,14 @@ class Drone:
     def close(self) -> None:
         self.log.close()
 
+    def _looked(self) -> None:
+        """Have a frame been looked at on the map in use, as a companion would say."""
+        self.estimator.seen_on = self.revision
+
     def track(self, n_landmarks: int) -> None:
         """Have the drone look at a frame with so many landmarks in it, without one at 0."""
         at_ns = self.clock.now_ns()
+        self._looked()
         predicted = self.estimator.predicted(at_ns, None)
         if n_landmarks == 0:
             self.estimator.take_nothing(predicted, at_ns, None)
@@ -140,6 +145,7 @@ class Drone:
 
     async def see(self, frame: Frame) -> None:
         """Have the drone take a frame, when its autopilot has measured at that instant."""
+        self._looked()
         self.clock.advance_to(frame.captured_at_ns)
         taken = demo.shot(self.system_id).ned_from_body
         self.autopilot.measure(frame.captured_at_ns, taken.quaternion())

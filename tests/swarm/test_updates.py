@@ -358,6 +358,15 @@ def test_a_view_from_a_new_place_is_a_reason() -> None:
     assert not judged([new] * 20 + [known] * 20)
 
 
+def test_a_map_that_no_frame_was_looked_at_on_is_not_voted_on() -> None:
+    vote = OwnVote(OPTIONS)
+    for k in range(20):
+        vote.look(FIRST, Sight(FEW), k * STEP_S)
+    assert vote.look(FIRST, Sight(FEW), 2.0) is True
+    assert vote.unseen() is False
+    assert vote.look(b"next", Sight(PLENTY), 2.1) is False
+
+
 def test_the_reasons_for_a_vote_are_bounded() -> None:
     with pytest.raises(ValueError, match="novelty_deg"):
         UpdateOptions(novelty_deg=0.0)

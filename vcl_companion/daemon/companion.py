@@ -204,6 +204,7 @@ class Companion:
         if isinstance(fix, NotLocalized) and may_fall_back:
             self._fell_back_at_s = now_s
         refused = self._take(frame, fix, ned_from_body)
+        self._estimator.seen_on = stored.revision
         sigma_m = math.inf if refused else self._estimator.sigma_m
         asked = self._inter.begin(frame, ned_from_body, stored.revision, sigma_m)
         if asked is not None:

@@ -66,6 +66,8 @@ class Estimator:
         """Landmarks of the map that the last frame showed; 0 when it was refused."""
         self.covered = 0.0
         """Share of the last frame that they filled; 0 when it was refused."""
+        self.seen_on = b""
+        """Revision of the map that the last frame was looked at on."""
         self.novelty_deg = 0.0
         """How differently they looked there from how they are remembered, degrees."""
 

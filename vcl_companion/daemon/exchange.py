@@ -324,6 +324,9 @@ class Exchange:
         stored = self._maps.current
         before = self._wants_update
         seen = self._estimator
+        if stored is not None and seen.seen_on != stored.revision:
+            self._wants_update = self._vote.unseen()
+            return self._wants_update != before
         sigma_m = seen.sigma_m if seen.tracked else None
         self._wants_update = self._vote.look(
             stored.revision if stored else b"",

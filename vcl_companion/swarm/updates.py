@@ -33,6 +33,8 @@ _JUDGED_SHARE = 0.5
 _STILL_COVERED = 0.8
 # An update that did not help is followed by a longer pause, up to so many intervals.
 _MAX_PAUSE = 8.0
+# Nobody knows at once whether an update has helped: only who wants none for so long, s.
+_CONTENT_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -149,7 +151,8 @@ class OwnVote:
 
         Returns:
             The vote. It stands through a change of map until the new one has
-            been seen for a while: what was wanted may not have come of it.
+            been seen for a while, unless ``unseen`` says that nothing of it has:
+            what was wanted may not have come of it.
         """
         if revision != self._revision:
             self._revision = revision
@@ -167,6 +170,11 @@ class OwnVote:
                 self._is_little() or self._is_narrow() or self._is_vague() or self._is_new()
             )
         return self._wants
+
+    def unseen(self) -> bool:
+        """Vote while no frame has been looked at on the map in use: nobody knows what it lacks."""
+        self._wants = False
+        return False
 
     def _is_little(self) -> bool:
         # Half of the window does not outvote the other half.
@@ -213,6 +221,7 @@ class UpdateTrigger:
         self._lost_since_s: dict[int, float] = {}
         self._ended_at_s = -math.inf
         self._n_in_vain = 0
+        self._content_since_s = math.inf
 
     def poll(self, now_s: float) -> None:
         """Look at the group; call it several times a second."""
@@ -221,10 +230,13 @@ class UpdateTrigger:
             self._revision, self._revision_since_s = group.newest_revision, now_s
         if not group.majority_wants_update:
             self._wanted_since_s = None
-            if not group.lacking():
+            self._content_since_s = min(self._content_since_s, now_s)
+            if not group.lacking() and now_s >= self._content_since_s + _CONTENT_S:
                 self._n_in_vain = 0  # the last one has helped
-        elif self._wanted_since_s is None:
-            self._wanted_since_s = now_s
+        else:
+            self._content_since_s = math.inf
+            if self._wanted_since_s is None:
+                self._wanted_since_s = now_s
         lost = [m for m in group.holders(self._revision) if self._revision and self._is_lost(m)]
         self._lost_since_s = {m: self._lost_since_s.get(m, now_s) for m in lost}
 
