@@ -208,6 +208,21 @@ def test_held_views_stay_and_the_others_find_their_place(n_held: int) -> None:
     )
 
 
+def test_a_view_that_sees_nothing_stays_and_the_others_are_adjusted() -> None:
+    rng = np.random.default_rng(12)
+    truth = truth_of(facade_scene(rng, 80, 4.0, n_views=4))
+    bodies = tuple(
+        body.retracted(0.02 * rng.standard_normal(6)) if i else body
+        for i, body in enumerate(truth.bodies)
+    )
+    ideal = truth.ideal.copy()
+    ideal[:, 3] = np.nan
+    adjusted, _ = adjust(replace(truth, bodies=bodies, ideal=ideal), BundleOptions())
+    for i in (1, 2):
+        assert_pose_close(adjusted.bodies[i], truth.bodies[i], within_m=1e-5, within_rad=1e-6)
+    assert_pose_close(adjusted.bodies[3], bodies[3], within_m=1e-12, within_rad=1e-12)
+
+
 def test_wrong_matches_pull_little() -> None:
     rng = np.random.default_rng(7)
     scene = facade_scene(rng, 150, 4.0, n_views=3, noise_px=0.3)

@@ -183,8 +183,10 @@ class _Problem:
 
     def step(self, system: _System, damping: float) -> tuple[Array, Array] | None:
         """Return the damped (6V,) pose step and (N, 3) point step; None where singular."""
-        free = slice(6 * self._n_held, len(system.rhs))
-        damped = system.normal[free, free] + damping * np.diag(system.diagonal[free])
+        # A view that sees nothing has no say, and would make the whole singular.
+        free = np.flatnonzero(system.diagonal > 0.0)
+        free = free[free >= 6 * self._n_held]
+        damped = system.normal[np.ix_(free, free)] + damping * np.diag(system.diagonal[free])
         pose_step = np.zeros(len(system.rhs))
         try:
             pose_step[free] = np.linalg.solve(damped, system.rhs[free])
