@@ -19,12 +19,13 @@ _LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 class Autopilot(asyncio.DatagramProtocol):
-    """Answers questions about time, measures one attitude, keeps what it is told.
+    """Answers questions about time, stays turned as it was last, keeps what it is told.
 
     Args:
         system_id: its vehicle's.
         boot_ns: its start, in the companion's time.
-        quaternion: (4,) w x y z, ned_from_body that it measures whenever it is asked the time.
+        quaternion: (4,) w x y z, ned_from_body until it is turned; whenever it is asked the
+            time, it measures how it is turned then.
     """
 
     def __init__(self, system_id: int, boot_ns: int, quaternion: Array) -> None:
@@ -58,7 +59,8 @@ class Autopilot(asyncio.DatagramProtocol):
                     self.poses.put_nowait(seen.fields)
 
     def measure(self, at_ns: int, quaternion: Array) -> None:
-        """Send an attitude of an instant of the companion's time."""
+        """Turn, and send that attitude as one of an instant of the companion's time."""
+        self._quaternion = quaternion
         boot_ms = (at_ns - self._boot_ns) // 1_000_000
         fields = (boot_ms, *(float(q) for q in quaternion), 0, 0, 0, 0, 0, 0, 0)
         self._say(wire.packed(wire.ATTITUDE_QUATERNION, *fields, system=self._system_id))
