@@ -23,7 +23,7 @@ from vcl_companion.localization.intra import (
 )
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.mapping.landmark_map import LandmarkMap
-from vcl_companion.vision.features import Features
+from vcl_companion.vision.features import Features, joined_features
 
 # Between the two keyframes and a little nearer to the facade.
 TRUTH = Pose(matrix_from_euler(0.02, -0.03, 0.05), np.array([1.0, 0.8, -0.3]))
@@ -249,6 +249,37 @@ def test_a_prediction_finds_what_the_whole_map_cannot_tell_apart(
     fix = located(features, index, prior)
     assert fix.guided
     assert_pose_close(fix.world_from_body, TRUTH, within_m=0.05, within_rad=0.005, least_m=1e-5)
+
+
+def test_a_wrong_prediction_that_look_alikes_confirm_is_found_out(
+    rng: np.random.Generator, relief: tuple[MapIndex, Descriptors]
+) -> None:
+    index, descriptors = relief
+    # 0.5 m beside it: within reach of what guides, far outside what pixel noise explains.
+    wrong = Pose(TRUTH.rotation, TRUTH.translation + np.array([0.0, 0.5, 0.0]))
+    order = rng.permutation(len(descriptors))
+    alike, others = np.split(order, [len(order) // 4])
+    whole = index.landmark_map
+    features = joined_features(
+        [
+            seen_from(
+                rng,
+                replace(
+                    whole,
+                    points_world=whole.points_world[those],
+                    observed_px=whole.observed_px[those],
+                ),
+                descriptors[those],
+                pose,
+                noise_px=0.3,
+            )
+            for those, pose in ((others, TRUTH), (alike, wrong))
+        ]
+    )
+    prior = prior_at(perturbed(rng, wrong, 0.05, 0.002), 0.15, 0.005)
+    led = located(features, index, prior)
+    assert not led.guided
+    assert_pose_close(led.world_from_body, TRUTH, within_m=0.05, within_rad=0.005, least_m=1e-5)
 
 
 @pytest.mark.parametrize(
