@@ -91,7 +91,7 @@ def extension(scene: Scene, first: LandmarkMap, shots: list[Shot], n_rounds: int
 
 
 def _ready(data: bytes, memory: FeatureMemory) -> ReadyMap:
-    return ready_map(MapOffer.of(BlobKind.MAP, data), None, "akaze", FEATURES, memory, True)
+    return ready_map(MapOffer.of(BlobKind.MAP, data), None, "akaze", FEATURES, memory, True, {})
 
 
 def _round(

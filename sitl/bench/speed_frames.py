@@ -36,7 +36,7 @@ _START = (
 def made_ready(landmark_map: LandmarkMap) -> ReadyMap:
     """Do what a daemon does with a map before it is flown on."""
     offer = MapOffer.of(BlobKind.MAP, encode_map(landmark_map))
-    return ready_map(offer, None, "akaze", FEATURES, FeatureMemory(FEATURES), True)
+    return ready_map(offer, None, "akaze", FEATURES, FeatureMemory(FEATURES), True, {})
 
 
 def shots_of(scene: Scene, n_instants: int) -> list[Shot]:
@@ -122,7 +122,7 @@ def cold_start(shots: list[Shot], landmark_map: LandmarkMap, effort: Effort) -> 
 
     def prepared() -> ReadyMap:
         offer = MapOffer.of(BlobKind.MAP, data)
-        return ready_map(offer, None, "akaze", FEATURES, FeatureMemory(FEATURES), True)
+        return ready_map(offer, None, "akaze", FEATURES, FeatureMemory(FEATURES), True, {})
 
     def once() -> None:
         located(next(turn), prepared(), True, None)

@@ -47,6 +47,7 @@ from vcl_companion.swarm.transfer import (
 from vcl_companion.swarm.updates import UpdateOptions
 from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame
+from vcl_companion.wire.map_update import name_of_image
 from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
 from vcl_companion.wire.pose_messages import PoseProposal, PoseRefused
 from vcl_companion.wire.tunnel import PayloadType, decode_payload, encode_payload
@@ -268,6 +269,17 @@ class Stranger:
         received = await self.blobs.get()
         assert received.kind == BlobKind.FRAME_ANSWER
         return received.blob, decode_frame(received.blob)
+
+    async def update_and_held(self, own_image: bytes) -> tuple[bytes, dict[bytes, bytes]]:
+        """Wait for an encoded update; return it and the images held by then, by their names."""
+        held = {name_of_image(own_image): own_image}
+        while True:
+            received = await self.blobs.get()
+            if received.kind == BlobKind.PASSED_FRAME:
+                image = decode_frame(received.blob, BlobKind.PASSED_FRAME).image_bytes
+                held[name_of_image(image)] = image
+            if received.kind == BlobKind.MAP_UPDATE:
+                return received.blob, held
 
     def _hear(self, tunnel: Tunnel) -> None:
         self._heard.add(tunnel.sender_system)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 
 from tests.daemon import demo
 from tests.daemon.swarm import Drone, Flyer, swarm
-from tests.daemon.waiting import hurry, run, until
+from tests.daemon.waiting import computed, passes, passes_until, run, until
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import matrix_from_euler
 from vcl_companion.swarm.transfer import BlobKind
@@ -24,33 +23,6 @@ from vcl_companion.wire.messages import FrameRequest, MapState
 PAIR, TRIO, NEXT = demo.encoded_map(1, 2), demo.encoded_map(1, 2, 3), demo.encoded_update()
 UPDATES = UpdateOptions()
 FEW, PLENTY = 10, 500
-
-
-async def passes(seconds: float) -> None:
-    """Let time pass in small steps, in which everybody says what there is to say."""
-    for _ in range(round(seconds / 0.25)):
-        hurry(0.25)
-        for _ in range(3):
-            await asyncio.sleep(0.002)
-
-
-async def passes_until(condition: Callable[[], bool], at_most_s: float = 60.0) -> None:
-    """Let time pass until something has come true."""
-    for _ in range(round(at_most_s / 0.25)):
-        if condition():
-            return
-        await passes(0.25)
-    assert condition()
-
-
-async def computed(condition: Callable[[], bool]) -> None:
-    """Wait for what takes a processor's time, however busy that is, to a bound."""
-    for _ in range(900):
-        if condition():
-            return
-        hurry(0.0)  # the test's own bound counts from here
-        await asyncio.sleep(0.1)
-    assert condition()
 
 
 def at_once(*drones: Drone, tracked: int) -> None:
@@ -146,16 +118,14 @@ def test_when_the_coordinator_dies_in_a_round_the_next_one_makes_it(tmp_path: Pa
             three.heard()
             await passes_until(lambda: bool(two.events("update")), 30.0)
             request = await three.asked()
-            answer = encode_frame(demo.answer(3, 12, request.request_id))
-            three.hand(BlobKind.FRAME_ANSWER, answer, 2)
+            answer = demo.answer(3, 12, request.request_id)
+            three.hand(BlobKind.FRAME_ANSWER, encode_frame(answer), 2)
             await computed(lambda: two.revision != old)
-            received = await three.blobs.get()
-            while received.kind != BlobKind.MAP_UPDATE:
-                received = await three.blobs.get()
-            data = decode_map_update(received.blob, decode_map(PAIR))
+            update, held = await three.update_and_held(answer.image_bytes)
+            data = decode_map_update(update, decode_map(PAIR), held)
             assert revision_of(data) == two.revision
             assert parent_of(data) == old
-            assert len(data) - len(received.blob) > 10_000  # two images
+            assert len(data) - len(update) > 20_000  # four images
             drones = [keyframe.drone_id for keyframe in decode_map(data).keyframes]
             assert drones[:2] == [1, 2]
             assert set(drones[2:]) == {2, 3}

@@ -66,3 +66,30 @@ async def beside(*work: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
         yield
         for task in tasks:
             task.cancel()
+
+
+async def passes(seconds: float) -> None:
+    """Let time pass in small steps, in which everybody says what there is to say."""
+    for _ in range(round(seconds / 0.25)):
+        hurry(0.25)
+        for _ in range(3):
+            await asyncio.sleep(0.002)
+
+
+async def passes_until(condition: Callable[[], bool], at_most_s: float = 60.0) -> None:
+    """Let time pass until something has come true."""
+    for _ in range(round(at_most_s / 0.25)):
+        if condition():
+            return
+        await passes(0.25)
+    assert condition()
+
+
+async def computed(condition: Callable[[], bool]) -> None:
+    """Wait for what takes a processor's time, however busy that is, to a bound."""
+    for _ in range(900):
+        if condition():
+            return
+        hurry(0.0)  # the test's own bound counts from here
+        await asyncio.sleep(0.1)
+    assert condition()

@@ -59,6 +59,17 @@ def test_golden_bytes() -> None:
     assert_frames_close(decode_frame(encode_frame(here)), here)
 
 
+def test_a_frame_passed_on_is_the_same_but_for_its_kind() -> None:
+    passed = encode_frame(small_frame(), BlobKind.PASSED_FRAME)
+    assert_golden("passed_frame", passed)
+    assert passed[2:] == encode_frame(small_frame())[2:]
+    assert_frames_close(decode_frame(passed, BlobKind.PASSED_FRAME), small_frame())
+    with pytest.raises(WireError, match="not a frame answer: blob kind 69"):
+        decode_frame(passed)
+    with pytest.raises(WireError, match="not a passed frame: blob kind 65"):
+        decode_frame(encode_frame(small_frame()), BlobKind.PASSED_FRAME)
+
+
 @given(_frames())
 def test_round_trip_keeps_the_frame_and_the_bytes(frame: FrameAnswer) -> None:
     data = encode_frame(frame)

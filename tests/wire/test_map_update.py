@@ -15,7 +15,14 @@ from vcl_companion.errors import WireError
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.wire.header import PROTOCOL_VERSION, VersionMismatchError
 from vcl_companion.wire.map_codec import decode_map, encode_map, parent_of, revision_of
-from vcl_companion.wire.map_update import decode_map_update, encode_map_update, names_of_update
+from vcl_companion.wire.map_update import (
+    decode_map_update,
+    encode_map_update,
+    images_in_update,
+    name_of_image,
+    names_of_update,
+    without_images,
+)
 
 PARENT = decode_map(encode_map(small_map()))
 
@@ -36,12 +43,13 @@ def child() -> LandmarkMap:
 
 
 CHILD = encode_map(child())
+NEW = name_of_image(b"a new image")
 
 
 def test_golden_bytes() -> None:
     blob = encode_map_update(CHILD, PARENT)
     assert_golden("map_update", blob)
-    assert decode_map_update(blob, PARENT) == CHILD
+    assert decode_map_update(blob, PARENT, {}) == CHILD
     assert names_of_update(blob) == (revision_of(CHILD), parent_of(CHILD))
     assert names_of_update(blob[:40]) == names_of_update(blob)
 
@@ -67,8 +75,33 @@ def test_what_comes_out_is_what_went_in(
         replace(more, keyframes=keyframes, observed_px=observed_px, parent=b"12345678")
     )
     blob = encode_map_update(data, parent)
-    assert decode_map_update(blob, parent) == data
+    assert decode_map_update(blob, parent, {}) == data
     assert len(data) - len(blob) == 498 * len(kept) - 8
+
+
+def test_golden_bytes_for_one_who_holds_the_new_image() -> None:
+    blob = without_images(encode_map_update(CHILD, PARENT), {NEW})
+    assert_golden("map_update_sent_ahead", blob)
+    assert decode_map_update(blob, PARENT, {NEW: b"a new image"}) == CHILD
+    assert names_of_update(blob) == (revision_of(CHILD), parent_of(CHILD))
+
+
+def test_only_what_is_held_stays_at_home() -> None:
+    update = encode_map_update(CHILD, PARENT)
+    assert images_in_update(update) == {NEW}
+    assert without_images(update, {name_of_image(b"another")}) == update
+    # Its parent's images are not in it, whoever holds them as well.
+    parents = {name_of_image(keyframe.image_bytes) for keyframe in PARENT.keyframes}
+    assert without_images(update, parents) == update
+    assert images_in_update(without_images(update, {NEW})) == set()
+
+
+def test_an_image_that_is_not_here_is_told_of() -> None:
+    blob = without_images(encode_map_update(CHILD, PARENT), {NEW})
+    with pytest.raises(WireError, match="sent ahead is not here"):
+        decode_map_update(blob, PARENT, {name_of_image(b"another"): b"another"})
+    with pytest.raises(WireError, match="another map"):
+        decode_map_update(blob, PARENT, {NEW: b"another"})
 
 
 def test_another_parent_is_refused() -> None:
@@ -76,37 +109,40 @@ def test_another_parent_is_refused() -> None:
     first, second = PARENT.keyframes
     other = replace(PARENT, keyframes=(first, replace(second, image_bytes=b"other")))
     with pytest.raises(WireError, match="another map"):
-        decode_map_update(blob, other)
+        decode_map_update(blob, other, {})
     fewer = replace(PARENT, keyframes=(first,), observed_px=PARENT.observed_px[:, :1], distances=())
     with pytest.raises(WireError, match="no keyframe 1"):
-        decode_map_update(blob, fewer)
+        decode_map_update(blob, fewer, {})
 
 
-def test_an_image_that_would_be_taken_for_a_reference_is_not_encoded() -> None:
-    short = replace(child().keyframes[1], image_bytes=b"ab")
+@pytest.mark.parametrize("image", [b"ab", b"abcdefgh"], ids=len)
+def test_an_image_that_would_be_taken_for_a_reference_is_not_encoded(image: bytes) -> None:
+    short = replace(child().keyframes[1], image_bytes=image)
     odd = replace(child(), keyframes=(child().keyframes[0], short, child().keyframes[2]))
-    with pytest.raises(ValueError, match="two bytes"):
+    with pytest.raises(ValueError, match="bytes is none"):
         encode_map_update(encode_map(odd), PARENT)
 
 
 @given(st.binary(max_size=200), st.sampled_from([b"", b"\x01", b"\x01\x44"]))
 def test_any_bytes_are_a_wire_error(body: bytes, head: bytes) -> None:
     with pytest.raises(WireError):
-        decode_map_update(head + body, PARENT)
+        decode_map_update(head + body, PARENT, {})
 
 
 @given(st.data())
 def test_mutated_updates_are_a_wire_error(data: st.DataObject) -> None:
-    blob = encode_map_update(CHILD, PARENT)
+    blob = without_images(encode_map_update(CHILD, PARENT), data.draw(st.sampled_from([{NEW}, {}])))
     at = data.draw(st.integers(0, len(blob) - 1))
     mutated = blob[:at] + data.draw(st.binary(max_size=4)) + blob[at + 1 :]
     if mutated == blob:
         return
     with pytest.raises(WireError):
-        decode_map_update(mutated, PARENT)
+        decode_map_update(mutated, PARENT, {NEW: b"a new image"})
 
 
-@pytest.mark.parametrize("decode", [names_of_update, lambda blob: decode_map_update(blob, PARENT)])
+@pytest.mark.parametrize(
+    "decode", [names_of_update, lambda blob: decode_map_update(blob, PARENT, {})]
+)
 def test_another_version_and_another_kind_are_recognised(decode: object) -> None:
     assert callable(decode)
     blob = encode_map_update(CHILD, PARENT)

@@ -29,6 +29,7 @@ from vcl_companion.daemon.inter_target import InterTarget
 from vcl_companion.daemon.map_rounds import MapRounds, RoundOptions
 from vcl_companion.daemon.map_sharing import MapSharing
 from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.daemon.refusals import Refusals
 from vcl_companion.errors import WireError
 from vcl_companion.links.autopilot import AutopilotLink
@@ -121,6 +122,15 @@ class Exchange:
         self._link: PeerLink | None = None
         self._refusals = Refusals(log)
         self._frames = FrameHistory()
+        memory = FeatureMemory(options.features)
+        self._passed = PassedFrames(
+            group,
+            partial(self._hand, BlobKind.PASSED_FRAME),
+            transfers.cancel,
+            executor,
+            memory,
+            options.detectors[0],
+        )
         self._answers = FrameAnswers(
             system_id,
             self._frames,
@@ -132,9 +142,9 @@ class Exchange:
             executor,
             partial(self._hand, BlobKind.FRAME_ANSWER),
             transfers.cancel,
+            self._passed.keep,
             options.map.keyframe_quality,
         )
-        memory = FeatureMemory(options.features)
         self._rounds = MapRounds(
             group,
             self._frames,
@@ -142,6 +152,7 @@ class Exchange:
             self._answers.describe,
             self._send,
             self._decide,
+            self._passed,
             lambda: transfers.is_receiving(BlobKind.MAP, self._now_s()),
             log,
             clock,
@@ -160,6 +171,7 @@ class Exchange:
             options.detectors,
             options.features,
             memory,
+            self._passed,
             options.update.delivery_wait_s,
             options.tracked,
         )
@@ -224,6 +236,7 @@ class Exchange:
         async with asyncio.TaskGroup() as parts:
             parts.create_task(self._rounds.run())
             parts.create_task(self._answers.run())
+            parts.create_task(self._passed.run())
             parts.create_task(self._sharing.run())
             parts.create_task(self._inter_host.run())
             parts.create_task(self._keep_going())
@@ -253,7 +266,7 @@ class Exchange:
             case MapState():
                 before = self._group.state_of(peer)
                 if before is not None and before.revision and not message.revision:
-                    self._sharing.forgot(peer)
+                    self._forgot(peer)
                 self._note(self._group.map_state(peer, message, now_s))
             case FrameRequest():
                 self._answers.want(peer, message)
@@ -275,9 +288,13 @@ class Exchange:
                     self._sharing.offer(peer, kind, blob)
                 case BlobReceived(peer=peer, kind=BlobKind.POSE_REQUEST, blob=blob):
                     self._inter_host.offer(peer, blob)
+                case BlobReceived(peer=peer, kind=BlobKind.PASSED_FRAME, blob=blob):
+                    self._take_passed(peer, blob)
                 case BlobDelivered(peer=peer, transfer_id=transfer_id):
+                    self._passed.ended(peer, transfer_id, delivered=True)
                     self._sharing.delivered(peer, transfer_id, self._now_s())
-                case TransferFailed(peer=peer, reason=reason):
+                case TransferFailed(peer=peer, transfer_id=transfer_id, reason=reason):
+                    self._passed.ended(peer, transfer_id, delivered=False)
                     self._log.event("transfer", f"to drone {peer}: {reason}")
                     _log.warning("transfer to drone %d failed: %s", peer, reason)
 
@@ -289,6 +306,17 @@ class Exchange:
             return
         if not self._rounds.take(peer, frame):
             self._refusals.count(peer, "frame nobody asked for")
+
+    def _take_passed(self, peer: int, blob: bytes) -> None:
+        try:
+            self._passed.take(peer, blob)
+        except WireError as error:
+            self._refusals.count(peer, "passed frame", str(error))
+
+    def _forgot(self, peer: int) -> None:
+        """Note that a peer may have lost what it was sent: it was restarted, or away."""
+        self._sharing.forgot(peer)
+        self._passed.forgot(peer)
 
     async def _decide(
         self, built: LandmarkMap | NoMap, instead_of: StoredMap | None, request_id: int
@@ -364,7 +392,7 @@ class Exchange:
             self._log.event("peer", f"drone {event.peer} {'joined' if joined else 'lost'}")
             _log.info("drone %d %s", event.peer, "joined" if joined else "is silent")
             if joined:
-                self._sharing.forgot(event.peer)
+                self._forgot(event.peer)
                 self._tell_state()
             else:
                 self.inter.lost(event.peer)

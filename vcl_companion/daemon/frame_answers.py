@@ -62,6 +62,7 @@ class FrameAnswers:
         executor: runs the encoding.
         hand: sends an answer to a peer; returns the transfer's id.
         cancel: ends a transfer, one that is over already too.
+        given: told of every image that is given to a peer.
         keyframe_quality: of the images, 1 to 100.
     """
 
@@ -77,6 +78,7 @@ class FrameAnswers:
         executor: Executor,
         hand: Callable[[int, bytes], int],
         cancel: Callable[[int], None],
+        given: Callable[[bytes], None],
         keyframe_quality: int,
     ) -> None:
         self._system_id = system_id
@@ -89,6 +91,7 @@ class FrameAnswers:
         self._executor = executor
         self._hand = hand
         self._cancel = cancel
+        self._note_given = given
         self._keyframe_quality = keyframe_quality
         self._wanted: PeerMailbox[_Wanted] = PeerMailbox()
         self._given: dict[int, _Given] = {}
@@ -130,7 +133,9 @@ class FrameAnswers:
         frame = self._frames.nearest(wanted.at_ns)
         if frame is None:
             return None
-        blob = encode_frame(await self.describe(frame, wanted.request_id))
+        answer = await self.describe(frame, wanted.request_id)
+        blob = encode_frame(answer)
+        self._note_given(answer.image_bytes)
         self._given.pop(peer, None)
         self._given[peer] = _Given(wanted.request_id, blob)
         if len(self._given) > _MAX_ASKERS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from vcl_companion.daemon.feature_memory import FeatureMemory
@@ -61,6 +62,7 @@ def ready_map(
     features: FeatureOptions,
     memory: FeatureMemory,
     tracked: bool,
+    held: Mapping[bytes, bytes],
 ) -> ReadyMap:
     """Decode, index and cut patches; takes a second, beside the event loop and the frames.
 
@@ -71,23 +73,24 @@ def ready_map(
         features: how they are found.
         memory: finds them.
         tracked: whether the map is also made ready to be tracked.
+        held: images that were sent ahead, by their names.
 
     Raises:
-        WireError: the bytes are no map, or need a parent that is not in use here.
+        WireError: the bytes are no map, or need a parent that is not in use here, or
+            an image that is not.
         ValueError: an image cannot be used, or the map is not determined.
     """
     has_parent = current is not None and current.revision == offer.parent
     parent = current.index.landmark_map if current is not None and has_parent else None
     if offer.kind == BlobKind.MAP:
-        data, update = offer.blob, b""
+        data = offer.blob
     elif parent is None:
         raise ValueError("an update of a map that is not in use here")
     else:
-        data, update = decode_map_update(offer.blob, parent), offer.blob
+        data = decode_map_update(offer.blob, parent, held)
 
     index = _indexed(decode_map(data), detector, features, memory)
-    if parent is not None and not update:
-        update = encode_map_update(data, parent)
+    update = b"" if parent is None else encode_map_update(data, parent)
     templates = prepare_templates(index.landmark_map, index.uncertainty) if tracked else None
     return ReadyMap(data, index, update, templates)
 

@@ -24,6 +24,7 @@ from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.gathering import Gathering, Wanted
 from vcl_companion.daemon.map_building import Distances, build_map, update_map
 from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.swarm.group import Group
@@ -71,6 +72,7 @@ class MapRounds:
         describe: makes the answer that a peer would give of one of our frames.
         ask: sends a request to a peer.
         decide: takes what became of a round.
+        passed: sends the frames of an update on while it is built.
         is_receiving_map: whether a peer's map has been coming in lately.
         log: told of every update that is begun.
         clock: time base of frames.
@@ -87,6 +89,7 @@ class MapRounds:
         describe: Callable[[Frame, int], Awaitable[FrameAnswer]],
         ask: Callable[[FrameRequest, int], None],
         decide: Decide,
+        passed: PassedFrames,
         is_receiving_map: Callable[[], bool],
         log: FlightLog,
         clock: Clock,
@@ -99,6 +102,8 @@ class MapRounds:
         self._maps = maps
         self._describe = describe
         self._decide = decide
+        self._passed = passed
+        self._is_updating = False
         self._is_receiving_map = is_receiving_map
         self._log = log
         self._clock = clock
@@ -110,7 +115,10 @@ class MapRounds:
 
     def take(self, peer: int, frame: FrameAnswer) -> bool:
         """Take a peer's frame; False when nobody asked for it."""
-        return self._gathering.take(peer, frame)
+        is_asked = self._gathering.take(peer, frame)
+        if is_asked and self._is_updating:
+            self._passed.pass_on(frame)
+        return is_asked
 
     async def run(self) -> None:
         """Make rounds until cancelled; each needs a frame that was not tried before."""
@@ -191,8 +199,15 @@ class MapRounds:
             update.joiner_spacing_s,
             update.gather_timeout_s,
         )
-        frames = await self._gathered(frame, wanted, lambda: self._is_past(stored))
+        self._passed.over()
+        self._is_updating = True
+        try:
+            frames = await self._gathered(frame, wanted, lambda: self._is_past(stored))
+        finally:
+            self._is_updating = False
         built = await self._built(frames, build)
+        if isinstance(built, NoMap):
+            self._passed.over()
         # Who is no more the coordinator has no say any more, and a map that came is newer.
         if not self._is_past(stored):
             await self._decide(built, stored, request_id)
@@ -214,6 +229,9 @@ class MapRounds:
             described = [await self._describe(f, self._gathering.request_id) for f in own]
         except ValueError as error:
             return NoMap(f"our own frame: {error}")
+        if self._is_updating:
+            for answer in described:
+                self._passed.pass_on(answer)
         began_s = self._now_s()
         gathered = described + await self._gathering.gather(wanted, is_over)
         _log.info("%d frames gathered in %.1f s", len(gathered), self._now_s() - began_s)

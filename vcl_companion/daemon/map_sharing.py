@@ -18,6 +18,7 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.mailbox import PeerMailbox
 from vcl_companion.daemon.map_offer import MapOffer, ReadyMap, ready_map, with_fallbacks
 from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.daemon.usage import give_back_freed
 from vcl_companion.errors import WireError
 from vcl_companion.mapping.landmark_map import LandmarkMap
@@ -26,6 +27,7 @@ from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.transfer import BlobKind, Transfers
 from vcl_companion.vision.features import Detector, FeatureOptions
 from vcl_companion.wire.map_codec import encode_map
+from vcl_companion.wire.map_update import images_in_update, without_images
 
 _log = logging.getLogger(__name__)
 
@@ -49,6 +51,15 @@ class _Handed:
     again_at_s: float
 
 
+@dataclass(frozen=True)
+class _Update:
+    """An update with all its images: whose, their names, and the forms for those who hold some."""
+
+    revision: bytes
+    images: frozenset[bytes]
+    without: dict[frozenset[bytes], bytes]
+
+
 class MapSharing:
     """One drone's part in everybody flying on the same map.
 
@@ -63,6 +74,7 @@ class MapSharing:
         detectors: the localization's own, and what it falls back on.
         features: how they are found.
         memory: finds them; only the executor's thread uses it.
+        passed: who was sent which image ahead.
         delivery_wait_s: how long a coordinator that is back with a map which we
             have left may take to be brought up to date; then it has its way.
         tracked: whether maps are made ready to be tracked by their patches.
@@ -80,6 +92,7 @@ class MapSharing:
         detectors: tuple[Detector, ...],
         features: FeatureOptions,
         memory: FeatureMemory,
+        passed: PassedFrames,
         delivery_wait_s: float,
         tracked: bool,
     ) -> None:
@@ -93,10 +106,12 @@ class MapSharing:
         self._detectors = detectors
         self._features = features
         self._memory = memory
+        self._passed = passed
         self._delivery_wait_s = delivery_wait_s
         self._tracked = tracked
         self._offered: PeerMailbox[MapOffer] = PeerMailbox()
         self._handed: dict[int, _Handed] = {}
+        self._update: _Update | None = None
         self._behind_since_s: float | None = None  # the coordinator, as far as known
 
     def offer(self, peer: int, kind: BlobKind, blob: bytes) -> None:
@@ -182,19 +197,35 @@ class MapSharing:
                 if now_s < last.again_at_s:
                     continue
                 n_delivered = last.n_delivered
-            kind, blob = self._form_for(peer, stored, n_delivered)
+            form = self._form_for(peer, stored, n_delivered)
+            if form is None:
+                continue
+            kind, blob = form
             sent_id = self._transfers.submit(peer, kind, blob, now_s)
             self._handed[peer] = _Handed(
                 stored.revision, sent_id, n_delivered, now_s + _HAND_AGAIN_S
             )
 
-    def _form_for(self, peer: int, stored: StoredMap, n_delivered: int) -> tuple[BlobKind, bytes]:
-        """Return what to send: without the images that a peer has, unless that was in vain."""
+    def _form_for(
+        self, peer: int, stored: StoredMap, n_delivered: int
+    ) -> tuple[BlobKind, bytes] | None:
+        """Return what to send: without the images that a peer has, unless that was in vain.
+
+        None while an image of the map is still on its way there.
+        """
         state = self._group.state_of(peer)
         has_parent = state is not None and state.revision == stored.parent
-        if stored.update and has_parent and n_delivered == 0:
-            return BlobKind.MAP_UPDATE, stored.update
-        return BlobKind.MAP, stored.data
+        if not (stored.update and has_parent and n_delivered == 0):
+            return BlobKind.MAP, stored.data
+        if self._update is None or self._update.revision != stored.revision:
+            self._update = _Update(stored.revision, images_in_update(stored.update), {})
+        images, without = self._update.images, self._update.without
+        if images & self._passed.on_their_way_to(peer):
+            return None
+        held = images & self._passed.held_by(peer)
+        if held not in without:
+            without[held] = without_images(stored.update, held)
+        return BlobKind.MAP_UPDATE, without[held]
 
     def _lacking(self, revision: bytes) -> list[int]:
         group = self._group
@@ -253,6 +284,7 @@ class MapSharing:
                 self._features,
                 self._memory,
                 self._tracked,
+                self._passed.held,
             )
         except (WireError, ValueError) as error:
             return NoMap(str(error))

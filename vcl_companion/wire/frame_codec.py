@@ -1,4 +1,7 @@
-"""The answer to a frame request: one drone's frame with all a peer needs to use it."""
+"""One drone's frame with all a peer needs to use it.
+
+It answers a frame request, and is passed on by who asked.
+"""
 
 from __future__ import annotations
 
@@ -88,13 +91,13 @@ class FrameAnswer:
         object.__setattr__(self, "ned_from_body", quaternion)
 
 
-def encode_frame(frame: FrameAnswer) -> bytes:
-    """Return the bytes of a frame answer; its attitude is rounded to 1e-9 rad.
+def encode_frame(frame: FrameAnswer, kind: BlobKind = BlobKind.FRAME_ANSWER) -> bytes:
+    """Return the bytes of a frame, answered or passed on; its attitude is rounded to 1e-9 rad.
 
     Raises:
         ValueError: the image or the camera is larger than peers accept.
     """
-    return encode_header(BlobKind.FRAME_ANSWER) + encode_frame_body(frame)
+    return encode_header(kind) + encode_frame_body(frame)
 
 
 def encode_frame_body(frame: FrameAnswer) -> bytes:
@@ -123,17 +126,17 @@ def encode_frame_body(frame: FrameAnswer) -> bytes:
     )
 
 
-def decode_frame(data: bytes) -> FrameAnswer:
-    """Return the frame answer of encoded bytes; the image stays encoded.
+def decode_frame(data: bytes, kind: BlobKind = BlobKind.FRAME_ANSWER) -> FrameAnswer:
+    """Return the frame of encoded bytes; the image stays encoded.
 
     Raises:
-        WireError: the bytes are not a frame answer, or one out of bounds.
+        WireError: the bytes are not a frame of this kind, or one out of bounds.
     """
     if len(data) > MAX_BLOB_BYTES:
         raise WireError(f"a frame answer of {len(data)} bytes, at most {MAX_BLOB_BYTES}")
-    kind = decode_header(data)
-    if kind != BlobKind.FRAME_ANSWER:
-        raise WireError(f"not a frame answer: blob kind {kind}")
+    found = decode_header(data)
+    if found != kind:
+        raise WireError(f"not a {kind.name.lower().replace('_', ' ')}: blob kind {found}")
     reader = Reader(data, "frame answer", HEADER_BYTES)
     frame = take_frame_body(reader)
     reader.finish()

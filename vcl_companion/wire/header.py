@@ -41,6 +41,7 @@ class BlobKind(IntEnum):
     MAP = 66
     POSE_REQUEST = 67
     MAP_UPDATE = 68
+    PASSED_FRAME = 69
 
 
 class VersionMismatchError(WireError):

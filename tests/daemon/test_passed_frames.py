@@ -1,0 +1,143 @@
+"""Frames sent ahead of the map that they go into: to whom, how often, and what is held of them."""
+
+from __future__ import annotations
+
+import asyncio
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.daemon import demo
+from tests.daemon.swarm import swarm
+from tests.daemon.waiting import computed, passes_until, run
+from tests.wire.samples import small_frame
+from vcl_companion.daemon.feature_memory import FeatureMemory
+from vcl_companion.daemon.passed_frames import PassedFrames
+from vcl_companion.errors import WireError
+from vcl_companion.swarm.group import Group, SwarmOptions
+from vcl_companion.swarm.transfer import BlobKind
+from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame, encode_frame
+from vcl_companion.wire.map_codec import decode_map, revision_of
+from vcl_companion.wire.map_update import decode_map_update, images_in_update, name_of_image
+from vcl_companion.wire.messages import MapState
+
+PAIR = demo.encoded_map(1, 2)
+
+
+class Member:
+    """The frames that one drone of three passes on and holds, and what it handed to whom."""
+
+    def __init__(self, own_id: int) -> None:
+        group = Group(SwarmOptions((1, 2, 3)), own_id)
+        for peer in {1, 2, 3} - {own_id}:
+            group.heartbeat(peer, 0.0)
+        self.handed: list[tuple[int, bytes]] = []
+        self.cancelled: list[int] = []
+        self.frames = PassedFrames(
+            group, self._hand, self.cancelled.append, ThreadPoolExecutor(1),
+            FeatureMemory(demo.FEATURES), "akaze",
+        )  # fmt: skip
+
+    def _hand(self, peer: int, blob: bytes) -> int:
+        self.handed.append((peer, blob))
+        return len(self.handed)
+
+
+def frame_of(drone_id: int, image: bytes) -> FrameAnswer:
+    return replace(small_frame(), drone_id=drone_id, image_bytes=image)
+
+
+def test_a_frame_goes_to_everybody_who_did_not_take_it_and_once() -> None:
+    one = Member(1)
+    own, two_s = frame_of(1, b"of one"), frame_of(2, b"of two")
+    for frame in (own, two_s, own, two_s):
+        one.frames.pass_on(frame)
+    assert [peer for peer, _ in one.handed] == [2, 3, 3]
+    assert [decode_frame(blob, BlobKind.PASSED_FRAME).image_bytes for _, blob in one.handed] == [
+        b"of one", b"of one", b"of two",
+    ]  # fmt: skip
+    name, of_two = name_of_image(b"of one"), name_of_image(b"of two")
+    assert one.frames.held_by(2) == {of_two}
+    assert one.frames.on_their_way_to(3) == {name, of_two}
+    one.frames.ended(2, 1, delivered=True)
+    one.frames.ended(3, 2, delivered=False)
+    one.frames.ended(3, 77, delivered=True)  # any other transfer
+    assert one.frames.held_by(2) == {name, of_two}
+    assert one.frames.held_by(3) == frozenset()
+    assert one.frames.on_their_way_to(3) == {of_two}
+    one.frames.pass_on(own)  # what failed is tried again
+    assert [peer for peer, _ in one.handed] == [2, 3, 3, 3]
+
+
+def test_what_nobody_needs_any_more_is_stopped() -> None:
+    one = Member(1)
+    one.frames.pass_on(frame_of(1, b"of one"))
+    one.frames.forgot(2)
+    assert one.cancelled == [1]
+    one.frames.over()
+    assert one.cancelled == [1, 2]
+    assert one.frames.on_their_way_to(3) == frozenset()
+
+
+def test_only_the_coordinator_s_frames_are_held_and_only_so_many() -> None:
+    three = Member(3)
+    blob = encode_frame(frame_of(2, b"of two"), BlobKind.PASSED_FRAME)
+    with pytest.raises(WireError, match="not by the coordinator"):
+        three.frames.take(2, blob)
+    with pytest.raises(WireError, match="not a passed frame"):
+        three.frames.take(1, encode_frame(frame_of(2, b"of two")))
+    three.frames.take(1, blob)
+    assert three.frames.held[name_of_image(b"of two")] == b"of two"
+    three.frames.keep(b"my own")
+    for n in range(100):
+        three.frames.take(1, encode_frame(frame_of(2, b"%d" % n), BlobKind.PASSED_FRAME))
+    assert len(three.frames.held) == 16
+    assert name_of_image(b"my own") not in three.frames.held
+    assert three.frames.held[name_of_image(b"99")] == b"99"
+
+
+def test_an_image_that_is_none_ends_nothing() -> None:
+    async def scenario() -> None:
+        three = Member(3)
+        looking = asyncio.create_task(three.frames.run())
+        three.frames.take(1, encode_frame(frame_of(2, b"no image"), BlobKind.PASSED_FRAME))
+        await asyncio.sleep(0.2)
+        assert not looking.done()
+        looking.cancel()
+
+    run(scenario())
+
+
+def test_an_update_comes_without_the_images_that_were_sent_ahead(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            one, two = [
+                await members.start(s, flies_on=(1, 2), update=UpdateOptions()) for s in (1, 2)
+            ]
+            three = await members.stranger(3)
+            await three.meets(1, 2)
+            old = revision_of(PAIR)
+            for to in (1, 2):
+                three.say(MapState(old, 1, True, 10, True), to)
+            await one.see(demo.frame(1, 12))
+            await two.see(demo.frame(2, 12))
+            for drone in (one, two):
+                drone.track(10)
+            asked = asyncio.create_task(three.asked())
+            await passes_until(asked.done)
+            answer = demo.answer(3, 12, asked.result().request_id)
+            three.hand(BlobKind.FRAME_ANSWER, encode_frame(answer), 1)
+            await computed(lambda: one.revision != old)
+            update, held = await three.update_and_held(answer.image_bytes)
+            assert len(held) == 3
+            assert images_in_update(update) == frozenset()
+            data = decode_map_update(update, decode_map(PAIR), held)
+            assert revision_of(data) == one.revision
+            assert len(data) - len(update) > 20_000
+            await computed(lambda: two.revision == one.revision)
+            assert dict(two.exchange.refused) == {}
+
+    run(scenario())

@@ -1,0 +1,157 @@
+"""The frames of a round at those who did not take them, while the map is still being built.
+
+Images are nearly all of a map's bytes, and known before it is. Passed on by the
+coordinator as they come, they are with everybody when the map is made: what has to
+wait for that, poses and landmarks, is a tenth.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+
+from vcl_companion.daemon.feature_memory import FeatureMemory
+from vcl_companion.errors import WireError
+from vcl_companion.swarm.group import Group
+from vcl_companion.vision.features import Detector
+from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame, encode_frame
+from vcl_companion.wire.header import BlobKind
+from vcl_companion.wire.map_update import name_of_image
+
+_log = logging.getLogger(__name__)
+
+# Two rounds of eight drones, forty kilobytes each.
+_N_HELD = 16
+
+
+@dataclass
+class _AtPeer:
+    """Names of the images that a peer holds, and of those on their way, by transfer."""
+
+    held: set[bytes] = field(default_factory=set)
+    on_their_way: dict[int, bytes] = field(default_factory=dict)
+
+
+class PassedFrames:
+    """Passes frames on as the coordinator, and holds their images as a member.
+
+    Args:
+        group: who is there.
+        hand: sends a frame to a peer; returns the transfer's id.
+        cancel: ends a transfer, one that is over already too.
+        executor: runs the detector on what has come.
+        memory: finds features; only the executor's thread uses it.
+        detector: the localization's own: a map with this image will be indexed by it.
+    """
+
+    def __init__(
+        self,
+        group: Group,
+        hand: Callable[[int, bytes], int],
+        cancel: Callable[[int], None],
+        executor: Executor,
+        memory: FeatureMemory,
+        detector: Detector,
+    ) -> None:
+        self._group = group
+        self._hand = hand
+        self._cancel = cancel
+        self._executor = executor
+        self._memory = memory
+        self._detector: Detector = detector
+        self._peers: dict[int, _AtPeer] = {}
+        self._held: dict[bytes, bytes] = {}
+        self._new: asyncio.Queue[FrameAnswer] = asyncio.Queue(_N_HELD)
+
+    @property
+    def held(self) -> Mapping[bytes, bytes]:
+        """Images that are here, by their names."""
+        return self._held
+
+    def keep(self, image_bytes: bytes) -> None:
+        """Hold an image of our own, as it was given to a peer."""
+        name = name_of_image(image_bytes)
+        self._held.pop(name, None)
+        self._held[name] = image_bytes  # the last one is the last to go
+        while len(self._held) > _N_HELD:
+            del self._held[next(iter(self._held))]
+
+    def take(self, peer: int, blob: bytes) -> None:
+        """Hold the image of a frame that the coordinator has passed on.
+
+        Raises:
+            WireError: it is no frame, or not from the coordinator.
+        """
+        if peer != self._group.coordinator:
+            raise WireError("a frame passed on, but not by the coordinator")
+        frame = decode_frame(blob, BlobKind.PASSED_FRAME)
+        self.keep(frame.image_bytes)
+        if not self._new.full():
+            self._new.put_nowait(frame)
+
+    async def run(self) -> None:
+        """Find the features of what has come, before the map needs them, until cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            frame = await self._new.get()
+            try:
+                await loop.run_in_executor(
+                    self._executor,
+                    self._memory.features,
+                    frame.image_bytes,
+                    frame.camera,
+                    self._detector,
+                )
+            except ValueError as error:
+                _log.debug("a frame of drone %d: %s", frame.drone_id, error)
+            except Exception:
+                # A peer's image went in: it may not end the flight.
+                _log.exception("a frame of drone %d cannot be looked at", frame.drone_id)
+
+    def pass_on(self, frame: FrameAnswer) -> None:
+        """Send a frame of a round to every member that neither took it nor coordinates."""
+        name = name_of_image(frame.image_bytes)
+        blob = b""
+        for peer in self._group.alive:
+            if peer == self._group.own_id:
+                continue
+            there = self._peers.setdefault(peer, _AtPeer())
+            if peer == frame.drone_id:
+                there.held.add(name)
+            elif name not in there.held and name not in there.on_their_way.values():
+                blob = blob or encode_frame(frame, BlobKind.PASSED_FRAME)
+                there.on_their_way[self._hand(peer, blob)] = name
+
+    def ended(self, peer: int, transfer_id: int, *, delivered: bool) -> None:
+        """Note that a transfer to a peer is over, one of ours or any other."""
+        there = self._peers.get(peer)
+        name = None if there is None else there.on_their_way.pop(transfer_id, None)
+        if there is not None and name is not None and delivered:
+            there.held.add(name)
+
+    def held_by(self, peer: int) -> frozenset[bytes]:
+        """Return the names of the images that a peer holds."""
+        there = self._peers.get(peer)
+        return frozenset() if there is None else frozenset(there.held)
+
+    def on_their_way_to(self, peer: int) -> frozenset[bytes]:
+        """Return the names of the images that a peer is being sent."""
+        there = self._peers.get(peer)
+        return frozenset() if there is None else frozenset(there.on_their_way.values())
+
+    def forgot(self, peer: int) -> None:
+        """Note that a peer may hold nothing any more: it was restarted, or away."""
+        self._stop(self._peers.pop(peer, None))
+
+    def over(self) -> None:
+        """Stop what is on its way, and forget who holds what: there is no map that needs it."""
+        for there in self._peers.values():
+            self._stop(there)
+        self._peers.clear()
+
+    def _stop(self, there: _AtPeer | None) -> None:
+        for transfer_id in there.on_their_way if there is not None else ():
+            self._cancel(transfer_id)
