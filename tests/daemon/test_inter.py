@@ -222,6 +222,32 @@ def test_what_cannot_be_believed_leaves_the_frame_refused(tmp_path: Path, answer
     run(scenario())
 
 
+def test_where_nobody_could_tell_nobody_is_asked_a_frame_later(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            drone, stranger = await asked_by(members, 2)
+            async with flying(drone, STARVED) as two:
+                two.give(0)
+                fog = PoseRefused((await request_of(stranger)).frame.request_id, "fog over there")
+                stranger.say(fog, 2)
+                await two.server.answered()
+                for k in (1, 2):
+                    two.give(k)
+                    await two.server.answered()
+                assert stranger.blobs.empty()
+                # 1.8 s after the last one it asks again, and where that helps, at every frame.
+                for k in (9, 10):
+                    two.give(k)
+                    request = await request_of(stranger)
+                    assert request.frame.captured_at_ns == demo.shot(2, k).at_ns
+                    stranger.say(proposal(request, demo.world_from_body(2, k)), 2)
+                    await two.server.answered()
+                outcomes = [outcome for _, outcome, _ in two.sources()]
+                assert outcomes == ["refused"] * 3 + ["localized"] * 2
+
+    run(scenario())
+
+
 def test_answers_nobody_asked_for_change_nothing(tmp_path: Path) -> None:
     """A wrong id, a wrong map, a second answer, a member that was not asked."""
 

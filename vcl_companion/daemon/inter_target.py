@@ -103,6 +103,7 @@ class InterTarget:
         self._request_id = int(rng.integers(1 << 32))
         self._n_since = 0
         self._last_at_ns: int | None = None
+        self._was_in_vain = False
         self._is_open = False
         self._asked: dict[int, Asked] = {}
 
@@ -123,10 +124,12 @@ class InterTarget:
         """
         self._n_since += math.isfinite(sigma_m)
         every_n = self._options.every_n_frames
-        is_due = sigma_m > self._options.weak_sigma_m or (
-            self._n_since >= every_n and self._is_long_ago(frame.captured_at_ns)
-        )
-        if every_n == 0 or self._is_open or not is_due:
+        is_weak = sigma_m > self._options.weak_sigma_m
+        if every_n == 0 or self._is_open or not (is_weak or self._n_since >= every_n):
+            return None
+        # Where nobody could tell, nobody can a frame later, and hosts that look for it all the
+        # time make no map that would help.
+        if (self._was_in_vain or not is_weak) and not self._is_long_ago(frame.captured_at_ns):
             return None
         hosts = self._hosts.choose(revision, self._options.max_hosts)
         if not hosts:
@@ -163,7 +166,9 @@ class InterTarget:
             self._is_open = False
             for transfer_id in transfers:
                 self._cancel(transfer_id)  # a fresher one is coming
-        return asked.handed_over()
+        said = asked.handed_over()
+        self._was_in_vain = not said
+        return said
 
     async def stragglers(self, asked: Asked) -> list[tuple[int, PoseProposal]]:
         """Wait for answers as long as they can still be fused, and forget the request."""

@@ -16,8 +16,9 @@ class InterMavOptions(InterOptions):
     Attributes:
         every_n_frames: localized frames from one request to the next; a frame
             that is refused asks anyway. 0: never asks, still answers.
-        least_interval_s: localized frames ask no more often, however many there are: an
-            answer costs each host a fifth of a second of one core.
+        least_interval_s: localized frames ask no more often, however many there are, nor
+            do refused ones when nobody could answer the last time: looking costs each
+            host a fifth of a second of one core.
         weak_sigma_m: a localized frame whose pose is less certain than this asks too.
         wait_s: a refused frame waits this long for an answer.
         max_hosts: peers asked at once.
