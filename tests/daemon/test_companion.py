@@ -106,7 +106,7 @@ def nobody_to_ask(executor: ThreadPoolExecutor, clock: ManualClock) -> InterTarg
     alone = HostChoice(Group(SwarmOptions(), DRONE))
     return InterTarget(
         DRONE, alone, demo.sensor(DRONE), clock, executor, lambda _, __: 0, lambda _: None,
-        InterMavOptions(), np.random.default_rng(0),
+        InterMavOptions(), np.random.default_rng(0), only_the_surer=True,
     )  # fmt: skip
 
 

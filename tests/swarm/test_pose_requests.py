@@ -37,15 +37,29 @@ def test_only_peers_that_are_localized_on_our_map_are_asked() -> None:
 def test_everybody_is_tried_then_the_surest_and_the_others_in_turn() -> None:
     choice = HostChoice(group_of(1, 2, 3, 4))
     assert choice.choose(MAP, 2) == [1, 2]
-    choice.answered(1, 0.5)
-    choice.answered(2, math.inf)
+    choice.answered(1, 0.5, 0)
+    choice.answered(2, math.inf, 0)
     assert choice.choose(MAP, 2) == [3, 4]
-    choice.answered(3, 0.1)
-    choice.answered(4, math.inf)
+    choice.answered(3, 0.1, 0)
+    choice.answered(4, math.inf, 0)
     assert choice.choose(MAP, 3) == [3, 1, 2]
     assert choice.choose(MAP, 3) == [3, 1, 4]  # who could not tell may be able to by now
     choice.lost(2)
     assert choice.choose(MAP, 1) == [2]  # back, and a new one
+
+
+def test_who_was_less_sure_of_us_than_we_are_is_asked_again_half_a_minute_later() -> None:
+    choice, second = HostChoice(group_of(1, 2)), 10**9
+    assert choice.may_know_better(MAP, 0.02, 0)  # never asked
+    assert not choice.may_know_better(OTHER, 0.02, 0)  # nobody flies on it
+    choice.answered(1, 0.1, 0)
+    choice.answered(2, math.inf, 5 * second)
+    assert not choice.may_know_better(MAP, 0.02, 29 * second)
+    assert choice.may_know_better(MAP, 0.2, 29 * second)
+    assert choice.may_know_better(MAP, 0.02, 31 * second)
+    choice.answered(1, 0.1, 31 * second)
+    assert not choice.may_know_better(MAP, 0.02, 34 * second)
+    assert choice.may_know_better(MAP, 0.02, 36 * second)  # the other one, by then
 
 
 @pytest.mark.parametrize(

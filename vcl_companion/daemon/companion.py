@@ -35,6 +35,9 @@ _LAST_FRAMES_S = 5.0
 # detector looks for a drone that is lost: it takes as long as ten frames.
 _DOUBT_EVERY_S = 5.0
 _FALL_BACK_EVERY_S = 1.0
+# A search in vain that took longer than frames are apart is not begun again before so many
+# times as long: on a small board the map that it needs would else never be made.
+_PAUSE_AFTER_VAIN = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +108,8 @@ class Companion:
         self._over = asyncio.Event()
         self._vain: StoredMap | None = None
         self._sent_at_ns = -1
-        self._doubted_at_s = self._fell_back_at_s = -math.inf
+        self._doubted_at_s = self._fell_back_at_s = self._search_again_at_s = -math.inf
+        self._searched: StoredMap | None = None
 
     async def read_camera(self) -> None:
         """Move frames from the camera to the mailbox until the stream ends and all are answered.
@@ -186,6 +190,7 @@ class Companion:
         predicted = self._estimator.predicted(at_ns, ned_from_body)
         now_s = asyncio.get_running_loop().time()
         may_fall_back = now_s >= self._fell_back_at_s + _FALL_BACK_EVERY_S
+        may_search = stored is not self._searched or now_s >= self._search_again_at_s
         fix = await asyncio.get_running_loop().run_in_executor(
             self._executor,
             localize,
@@ -197,12 +202,13 @@ class Companion:
             predicted.prior() if predicted else None,
             ned_from_body,
             self._options,
-            Effort(now_s >= self._doubted_at_s + _DOUBT_EVERY_S, may_fall_back),
+            Effort(may_search, now_s >= self._doubted_at_s + _DOUBT_EVERY_S, may_fall_back),
         )
         if isinstance(fix, Localized) and is_doubtful(fix):
             self._doubted_at_s = now_s
-        if isinstance(fix, NotLocalized) and may_fall_back:
-            self._fell_back_at_s = now_s
+        if isinstance(fix, NotLocalized) and may_search:
+            self._searched_in_vain(stored, now_s)
+            self._fell_back_at_s = now_s if may_fall_back else self._fell_back_at_s
         refused = self._take(frame, fix, ned_from_body)
         self._estimator.seen_on = stored.revision
         sigma_m = math.inf if refused else self._estimator.sigma_m
@@ -213,6 +219,13 @@ class Companion:
             self._outcomes.close(frame)
             return None
         return await self._given_up(frame, stored, refused)
+
+    def _searched_in_vain(self, stored: StoredMap, began_at_s: float) -> None:
+        """Note a search that found nothing, and whether it kept the next frame waiting."""
+        ended_at_s = asyncio.get_running_loop().time()
+        self._searched = stored
+        if self._mailbox.is_filled:
+            self._search_again_at_s = ended_at_s + _PAUSE_AFTER_VAIN * (ended_at_s - began_at_s)
 
     async def _given_up(
         self, frame: Frame, stored: StoredMap, refused: NotLocalized

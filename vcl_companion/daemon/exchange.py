@@ -185,6 +185,7 @@ class Exchange:
             transfers.cancel,
             options.inter,
             rng,
+            only_the_surer=options.tracked,
         )
         self._inter_host = InterHost(
             maps,

@@ -78,6 +78,8 @@ class InterTarget:
         cancel: ends a transfer, one that is over already too.
         options: how often, how many, how long.
         rng: numbers the requests.
+        only_the_surer: whether a localized frame asks only while a peer may know better
+            than we do; else the paper's way, every so many frames whatever came of it.
     """
 
     def __init__(
@@ -91,12 +93,14 @@ class InterTarget:
         cancel: Callable[[int], None],
         options: InterMavOptions,
         rng: np.random.Generator,
+        only_the_surer: bool,
     ) -> None:
         self._system_id = system_id
         self._hosts = hosts
         self._sensor = sensor
         self._clock = clock
         self._executor = executor
+        self._only_the_surer = only_the_surer
         self._hand = hand
         self._cancel = cancel
         self._options = options
@@ -124,18 +128,25 @@ class InterTarget:
         """
         self._n_since += math.isfinite(sigma_m)
         every_n = self._options.every_n_frames
+        at_ns = frame.captured_at_ns
         is_weak = sigma_m > self._options.weak_sigma_m
         if every_n == 0 or self._is_open or not (is_weak or self._n_since >= every_n):
             return None
         # Where nobody could tell, nobody can a frame later, and hosts that look for it all the
         # time make no map that would help.
-        if (self._was_in_vain or not is_weak) and not self._is_long_ago(frame.captured_at_ns):
+        if (self._was_in_vain or not is_weak) and not self._is_long_ago(at_ns):
+            return None
+        if (
+            self._only_the_surer
+            and not is_weak
+            and not self._hosts.may_know_better(revision, sigma_m, at_ns)
+        ):
             return None
         hosts = self._hosts.choose(revision, self._options.max_hosts)
         if not hosts:
             return None
         self._n_since = 0
-        self._last_at_ns = frame.captured_at_ns
+        self._last_at_ns = at_ns
         self._is_open = True
         self._request_id = (self._request_id + 1) % (1 << 32)
         asked = Asked(self._request_id, frame, ned_from_body, revision, set(hosts))
@@ -187,9 +198,9 @@ class InterTarget:
             if answer.revision != asked.revision:
                 return False
             asked.proposals.append((peer, answer))
-            self._hosts.answered(peer, _sigma_m(answer))
+            self._hosts.answered(peer, _sigma_m(answer), asked.frame.captured_at_ns)
         else:
-            self._hosts.answered(peer, math.inf)
+            self._hosts.answered(peer, math.inf, asked.frame.captured_at_ns)
             _log.debug("drone %d proposes no pose: %s", peer, answer.reason)
         self._answered(asked, peer)
         return True

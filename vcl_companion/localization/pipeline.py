@@ -51,10 +51,12 @@ class Effort:
     """What may be tried that takes as long as several frames.
 
     Attributes:
+        may_search: whether features are looked for when patches alone give no pose.
         may_doubt: whether features are asked about a pose that few patches agree on.
         may_fall_back: whether a second detector is asked when the first one fails.
     """
 
+    may_search: bool = True
     may_doubt: bool = True
     may_fall_back: bool = True
 
@@ -108,6 +110,8 @@ def localize(
             )
             more = isinstance(again, Localized) and again.n_inliers > tracked.n_inliers
             return again if more else tracked
+    if templates is not None and not effort.may_search:
+        return tracked or NotLocalized("lost, and looked for in vain a moment ago")
     found = _recognised(
         image, camera, body_from_cam, index, templates, prior, ned_from_body, options
     )

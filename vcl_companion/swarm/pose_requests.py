@@ -14,8 +14,9 @@ class InterMavOptions(InterOptions):
     """When peers are asked where we are, and how a host looks for it.
 
     Attributes:
-        every_n_frames: localized frames from one request to the next; a frame
-            that is refused asks anyway. 0: never asks, still answers.
+        every_n_frames: localized frames from one request to the next, by the default
+            pipeline only while a peer may know better; a frame that is refused asks
+            anyway. 0: never asks, still answers.
         least_interval_s: localized frames ask no more often, however many there are, nor
             do refused ones when nobody could answer the last time: looking costs each
             host a fifth of a second of one core.
@@ -51,6 +52,10 @@ class InterMavOptions(InterOptions):
             raise ValueError(f"request_quality must lie in 1..100, got {self.request_quality}")
 
 
+# What peers knew so long ago tells no more whether they know better than we do.
+_REMEMBERED_S = 30.0
+
+
 class HostChoice:
     """Remembers how sure each peer's last answer was.
 
@@ -61,6 +66,7 @@ class HostChoice:
     def __init__(self, group: Group) -> None:
         self._group = group
         self._sigma_m: dict[int, float] = {}
+        self._told_at_ns: dict[int, int] = {}
         self._asked_in: dict[int, int] = {}
         self._n_requests = 0
 
@@ -70,12 +76,7 @@ class HostChoice:
         First those that were never asked, then the surest of those who answered,
         then those who could not tell, the one that was not asked for longest first.
         """
-        group = self._group
-        able = [
-            peer
-            for peer in group.holders(revision)
-            if peer != group.own_id and (state := group.state_of(peer)) and state.localized
-        ]
+        able = self._able(revision)
         able.sort(key=lambda p: (self._sigma_m.get(p, 0.0), self._asked_in.get(p, 0), p))
         chosen = able[:at_most]
         self._n_requests += 1
@@ -83,11 +84,36 @@ class HostChoice:
             self._asked_in[peer] = self._n_requests
         return chosen
 
-    def answered(self, peer: int, sigma_m: float) -> None:
+    def may_know_better(self, revision: bytes, sigma_m: float, at_ns: int) -> bool:
+        """Whether a peer was surer of us than we are, or has not been asked for long.
+
+        Args:
+            revision: of our map.
+            sigma_m: of our position, in its worst direction.
+            at_ns: now, in the time of ``answered``.
+        """
+        return any(
+            self._sigma_m.get(peer, 0.0) < sigma_m
+            or at_ns - self._told_at_ns[peer] > _REMEMBERED_S * 1e9
+            for peer in self._able(revision)
+        )
+
+    def answered(self, peer: int, sigma_m: float, at_ns: int) -> None:
         """Note how sure an answer was; infinite for a peer that could not tell."""
         self._sigma_m[peer] = sigma_m
+        self._told_at_ns[peer] = at_ns
+
+    def _able(self, revision: bytes) -> list[int]:
+        """Return the peers that are localized in a map."""
+        group = self._group
+        return [
+            peer
+            for peer in group.holders(revision)
+            if peer != group.own_id and (state := group.state_of(peer)) and state.localized
+        ]
 
     def lost(self, peer: int) -> None:
         """Forget a peer: when it comes back it is a new one."""
         self._sigma_m.pop(peer, None)
+        self._told_at_ns.pop(peer, None)
         self._asked_in.pop(peer, None)
