@@ -208,7 +208,8 @@ class Companion:
             self._doubted_at_s = now_s
         if isinstance(fix, NotLocalized) and may_search:
             self._searched_in_vain(stored, now_s)
-            self._fell_back_at_s = now_s if may_fall_back else self._fell_back_at_s
+            if may_fall_back and stored.index.fallback is not None:
+                self._fell_back_at_s = now_s
         refused = self._take(frame, fix, ned_from_body)
         self._estimator.seen_on = stored.revision
         sigma_m = math.inf if refused else self._estimator.sigma_m
@@ -224,6 +225,7 @@ class Companion:
         """Note a search that found nothing, and whether it kept the next frame waiting."""
         ended_at_s = asyncio.get_running_loop().time()
         self._searched = stored
+        self._maps.want_more()
         if self._mailbox.is_filled:
             self._search_again_at_s = ended_at_s + _PAUSE_AFTER_VAIN * (ended_at_s - began_at_s)
 

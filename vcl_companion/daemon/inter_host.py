@@ -11,6 +11,7 @@ import logging
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor
+from contextlib import suppress
 
 import numpy as np
 
@@ -44,6 +45,8 @@ _log = logging.getLogger(__name__)
 _N_KEPT = 3
 # Our own frame of that moment may be being looked at right now.
 _SETTLE_S = 0.5
+# The map may have to be indexed by our detector first, behind an update that is being built.
+_INDEX_WAIT_S = 3.0
 
 
 class InterHost:
@@ -121,6 +124,7 @@ class InterHost:
         own = await self._own_near(came_at_ns - round(request.frame.frame_age_s * 1e9))
         if own is None:
             return NoProposal("the host does not know where it was then")
+        stored = await self._indexed(stored)
         loop = asyncio.get_running_loop()
         try:
             return await loop.run_in_executor(
@@ -132,6 +136,18 @@ class InterHost:
             # Peers' images and numbers went in: none of them may end the flight.
             _log.exception("a pose request cannot be worked on")
             return NoProposal(f"looking failed: {type(error).__name__}")
+
+    async def _indexed(self, stored: StoredMap) -> StoredMap:
+        """Return the map with an index by our detector, if the daemon makes one soon."""
+        if self._look.known_index(stored) is not None:
+            return stored
+        self._maps.want_more()
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_INDEX_WAIT_S):
+                await self._maps.newer_than(stored)
+        current = self._maps.current
+        is_same = current is not None and current.revision == stored.revision
+        return current if is_same and current is not None else stored
 
     async def _own_near(self, at_ns: int) -> tuple[Frame, FilterState] | None:
         """Return our frame nearest to an instant that had a fix, and what we believed then."""
@@ -201,13 +217,18 @@ class _Look:
         self._own.append((frame.sequence, found))
         return found
 
-    def _index_of(self, stored: StoredMap) -> MapIndex:
+    def known_index(self, stored: StoredMap) -> MapIndex | None:
+        """Return the map's index by our detector, if there is one."""
         known: MapIndex | None = stored.index
-        while known is not None:
-            if known.detector == self._options.detector:
-                return known
+        while known is not None and known.detector != self._options.detector:
             known = known.fallback
-        if self._index is None or self._index[0] != stored.revision:
-            index = index_map(stored.index.landmark_map, self._options.detector, self._features)
-            self._index = (stored.revision, index)
-        return self._index[1]
+        if known is None and self._index is not None and self._index[0] == stored.revision:
+            return self._index[1]
+        return known
+
+    def _index_of(self, stored: StoredMap) -> MapIndex:
+        known = self.known_index(stored)
+        if known is None:
+            known = index_map(stored.index.landmark_map, self._options.detector, self._features)
+            self._index = (stored.revision, known)
+        return known

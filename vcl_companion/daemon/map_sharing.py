@@ -138,7 +138,13 @@ class MapSharing:
             )
 
     async def run(self) -> None:
-        """Take in what peers offer, one map after the other, until cancelled."""
+        """Take in what peers offer, and index what is in use, until cancelled."""
+        async with asyncio.TaskGroup() as parts:
+            parts.create_task(self._take_offers())
+            parts.create_task(self._index_more())
+
+    async def _take_offers(self) -> None:
+        """Look at one map after the other."""
         while True:
             peer, offer = await self._offered.take()
             current = self._maps.current
@@ -303,15 +309,28 @@ class MapSharing:
         self._tell_state()
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._executor, self._maps.keep, stored)
-        # Frames fly on it meanwhile: who is not lost does not need this, and it takes seconds.
-        index = await loop.run_in_executor(
-            self._executor,
-            with_fallbacks,
-            stored.index,
-            self._detectors[1:],
-            self._features,
-            self._memory,
-        )
-        self._maps.improve(stored, index)
         # Making it took a hundred megabytes more than it is.
         await loop.run_in_executor(self._executor, give_back_freed)
+
+    async def _index_more(self) -> None:
+        """Index the map in use by the other detectors when that is asked for, once each.
+
+        It takes as long as the map itself, and most revisions are never asked about.
+        """
+        loop = asyncio.get_running_loop()
+        done = b""
+        while True:
+            stored = await self._maps.more_wanted()
+            if stored.revision == done or not self._detectors[1:]:
+                continue
+            index = await loop.run_in_executor(
+                self._executor,
+                with_fallbacks,
+                stored.index,
+                self._detectors[1:],
+                self._features,
+                self._memory,
+            )
+            done = stored.revision
+            self._maps.improve(stored, index)
+            await loop.run_in_executor(self._executor, give_back_freed)

@@ -70,6 +70,7 @@ class MapStore:
         self._directory = Path(directory) if directory else None
         self._left: deque[bytes] = deque(maxlen=_MAX_LEFT)
         self._decided = asyncio.Event()
+        self._more_wanted = asyncio.Event()
         if self._directory is not None:
             try:
                 self._directory.mkdir(parents=True, exist_ok=True)
@@ -101,6 +102,18 @@ class MapStore:
         if self.current is stored:
             self.current = replace(stored, index=index)
             self._decided.set()
+
+    def want_more(self) -> None:
+        """Ask for the other detectors' indexes of the map in use: its own did not suffice."""
+        self._more_wanted.set()
+
+    async def more_wanted(self) -> StoredMap:
+        """Wait until somebody asks for them; return the map in use."""
+        while True:
+            await self._more_wanted.wait()
+            self._more_wanted.clear()
+            if self.current is not None:
+                return self.current
 
     def is_in_use(self, stored: StoredMap | None) -> bool:
         """Whether we fly on a revision, or, for None, on no map at all."""
