@@ -154,6 +154,7 @@ class Sky:
             if self.now_s >= member.round_ends_at_s:
                 self._finish(member)
         elif member.trigger.is_due(self.now_s):
+            member.trigger.begun()
             self.begun.append((self.now_s, own_id))
             self.begun_alone.append(member.group.alive == (own_id,))
             member.round_ends_at_s = self.now_s + self.round_s
@@ -324,6 +325,17 @@ def test_rounds_that_do_not_help_become_rare_until_one_helps() -> None:
     sky.run(16.0)
     pauses = np.diff([at_s for at_s, _ in sky.begun[n_before:]]) - sky.round_s
     assert pauses[0] == pytest.approx(interval_s, abs=4 * STEP_S)
+
+
+def test_rounds_that_show_more_for_a_moment_only_stay_frequent() -> None:
+    sky = Sky((1, 2, 3))
+    for n_made in range(1, 6):
+        sky.see(FEW, 1, 2, 3)
+        sky.run(30.0, lambda n_made=n_made: sky.n_made == n_made)  # type: ignore[misc]
+        sky.run(1.4)  # in fast flight what was gained is soon out of sight
+    pauses = np.diff([at_s for at_s, _ in sky.begun]) - sky.round_s
+    assert len(pauses) == 4
+    assert (pauses < OPTIONS.interval_s + 1.0).all()
 
 
 def judged(sights: list[Sight]) -> bool:

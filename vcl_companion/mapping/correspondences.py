@@ -18,7 +18,7 @@ from vcl_companion.mapping.joining import Joined
 from vcl_companion.mapping.known_features import KeyframeLibrary
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.tracks import PairMatches
-from vcl_companion.mapping.visibility import match_features
+from vcl_companion.mapping.visibility import MutualMatches, match_features
 
 # A registered view is matched with this many keyframes that overlap it most.
 _PARTNERS = 2
@@ -34,10 +34,13 @@ class Correspondences:
     Args:
         library: the features of the keyframes.
         views: the new views.
+        matches: remembers those of earlier attempts.
     """
 
-    def __init__(self, library: KeyframeLibrary, views: list[DroneView]) -> None:
-        self._library, self._views = library, views
+    def __init__(
+        self, library: KeyframeLibrary, views: list[DroneView], matches: MutualMatches
+    ) -> None:
+        self._library, self._views, self._matches = library, views, matches
         self.pairs = Pairs({}, {})
 
     def likely(self, known: LandmarkMap, view: DroneView) -> list[int]:
@@ -58,7 +61,7 @@ class Correspondences:
         """Return the matches of a keyframe with a view."""
         if (k, i) not in self.pairs.with_keyframes:
             self.pairs.with_keyframes[k, i] = match_features(
-                self._library.of(k).features, self._views[i].features
+                self._library.of(k).features, self._views[i].features, self._matches
             )
         return self.pairs.with_keyframes[k, i]
 
@@ -82,7 +85,7 @@ class Correspondences:
         for i, k in self._view_pairs(known, joined):
             if (i, k) not in self.pairs.with_views:
                 self.pairs.with_views[i, k] = match_features(
-                    self._views[i].features, self._views[k].features
+                    self._views[i].features, self._views[k].features, self._matches
                 )
 
     def _view_pairs(self, known: LandmarkMap, joined: dict[int, Joined]) -> list[tuple[int, int]]:

@@ -27,6 +27,7 @@ from vcl_companion.mapping.patch_table import PyramidOf, decoded_pyramid
 from vcl_companion.mapping.reconstruction import accepted
 from vcl_companion.mapping.tracks import PairMatches
 from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
+from vcl_companion.mapping.visibility import MutualMatches
 from vcl_companion.vision.features import Detector, FeatureOptions, Features, detect
 
 # Keyframes that a view is matched with before it is given up.
@@ -88,7 +89,7 @@ def extended(
         return NoMap("there is no view that the map does not have already")
     try:
         sure = sure or map_uncertainty(old)
-        growth = _grown(old, sure, views, features_of, options, seed, pyramid_of)
+        growth = _grown(old, sure, views, features_of, options, seed, pyramid_of, MutualMatches())
     except ValueError as error:
         return NoMap(str(error))
     if isinstance(growth, NoMap):
@@ -108,6 +109,7 @@ def _grown(
     options: MapOptions,
     seed: int,
     pyramid_of: PyramidOf,
+    matches: MutualMatches,
 ) -> Growth | NoMap:
     """Join views by patches, then the others by features on what came of it.
 
@@ -116,16 +118,16 @@ def _grown(
     """
     growth: Growth | None = None
     if options.patches:
-        views = _guessed(old, sure, views, features_of, options, seed)
+        views = _guessed(old, sure, views, features_of, options, seed, matches)
         growth = Extension(old, sure, views, features_of, pyramid_of, options).run()
     if growth is None:
-        return _by_features(old, sure, views, features_of, options, seed, pyramid_of)
+        return _by_features(old, sure, views, features_of, options, seed, pyramid_of, matches)
     waiting = [v for i, v in enumerate(views) if i not in growth.views]
     if not waiting:
         return growth
     known = growth.landmark_map
     late = _by_features(
-        known, map_uncertainty(known), waiting, features_of, options, seed, pyramid_of
+        known, map_uncertainty(known), waiting, features_of, options, seed, pyramid_of, matches
     )
     if isinstance(late, NoMap):
         return growth
@@ -139,6 +141,7 @@ def _guessed(
     features_of: ImageFeatures,
     options: MapOptions,
     seed: int,
+    matches: MutualMatches,
 ) -> list[DroneView]:
     """Return the views, with poses by features for those that do not say where they are."""
     out = list(views)
@@ -153,7 +156,7 @@ def _guessed(
             except ValueError:
                 continue
             shown = replace(view, features=found)
-            pose = _Update(old, sure, [shown], library, options, seed).pose_on_old()
+            pose = _Update(old, sure, [shown], library, options, seed, matches).pose_on_old()
             out[i] = replace(view, world_from_body=pose)
     return out
 
@@ -166,6 +169,7 @@ def _by_features(
     options: MapOptions,
     seed: int,
     pyramid_of: PyramidOf,
+    matches: MutualMatches,
 ) -> Growth | NoMap:
     """Register views by their features; that done, by patches if they can be seen from there."""
     usable = []
@@ -178,7 +182,7 @@ def _by_features(
     if not usable:
         return NoMap("no frame has come that can be used")
     library = KeyframeLibrary(known, of_keyframes(features_of, options.detectors))
-    late = _Update(known, sure, usable, library, options, seed).run()
+    late = _Update(known, sure, usable, library, options, seed, matches).run()
     if isinstance(late, NoMap) or not options.patches:
         return late
     found_at = late.landmark_map.keyframes[len(known.keyframes) :]
@@ -201,10 +205,11 @@ class _Update:
         library: KeyframeLibrary,
         options: MapOptions,
         seed: int,
+        matches: MutualMatches,
     ) -> None:
         self._old, self._sure, self._views = old, sure, views
         self._library, self._options, self._seed = library, options, seed
-        self._matches = Correspondences(library, views)
+        self._matches = Correspondences(library, views, matches)
         self._joined: dict[int, Joined] = {}
         self._reasons: dict[int, str] = {}
         self._refuted: set[int] = set()

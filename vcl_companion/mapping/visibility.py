@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, log_so3
@@ -15,6 +16,8 @@ from vcl_companion.mapping.tracks import PairMatches
 from vcl_companion.vision.essential import EssentialOptions, RelativePose, relative_poses
 from vcl_companion.vision.features import Features
 from vcl_companion.vision.matching import MatchOptions, match_mutual
+
+Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,12 +120,36 @@ def _edge(a: DroneView, b: DroneView, matches: PairMatches, options: MapOptions,
     return Edge(agreed, chosen)
 
 
-def match_features(a: tuple[Features, ...], b: tuple[Features, ...]) -> PairMatches:
-    """Match two images, detector by detector; indices count one detector after the other."""
+class MutualMatches:
+    """Matches of images, detector by detector, found once however often a round asks for them."""
+
+    def __init__(self) -> None:
+        # With the pixels, so that what is known by its identity stays alive.
+        self._known: dict[tuple[int, int], tuple[Array, Array, Index, Index]] = {}
+
+    def of(self, a: Features, b: Features) -> tuple[Index, Index]:
+        """Return what ``match_mutual`` does."""
+        key = (id(a.pixels), id(b.pixels))
+        if key not in self._known:
+            self._known[key] = (a.pixels, b.pixels, *match_mutual(a, b, MatchOptions()))
+        return self._known[key][2:]
+
+
+def match_features(
+    a: tuple[Features, ...], b: tuple[Features, ...], matches: MutualMatches | None = None
+) -> PairMatches:
+    """Match two images, detector by detector; indices count one detector after the other.
+
+    Args:
+        a: features of one image, a set for each detector.
+        b: of the other.
+        matches: remembers them; None for a pair that comes once.
+    """
+    matches = matches or MutualMatches()
     rows, columns = [], []
     start_a = start_b = 0
     for features_a, features_b in zip(a, b, strict=True):
-        i, k = match_mutual(features_a, features_b, MatchOptions())
+        i, k = matches.of(features_a, features_b)
         rows.append(i + start_a)
         columns.append(k + start_b)
         start_a += len(features_a)

@@ -33,7 +33,9 @@ _JUDGED_SHARE = 0.5
 _STILL_COVERED = 0.8
 # An update that did not help is followed by a longer pause, up to so many intervals.
 _MAX_PAUSE = 8.0
-# Nobody knows at once whether an update has helped: only who wants none for so long, s.
+# An update has helped when the majority sees so many times what it saw before, or wants none
+# for so long, s: in fast flight the next one is wanted sooner.
+_SEES_MORE = 1.3
 _CONTENT_S = 2.0
 
 
@@ -222,6 +224,7 @@ class UpdateTrigger:
         self._ended_at_s = -math.inf
         self._n_in_vain = 0
         self._content_since_s = math.inf
+        self._before: tuple[bytes, dict[int, int]] | None = None
 
     def poll(self, now_s: float) -> None:
         """Look at the group; call it several times a second."""
@@ -231,12 +234,13 @@ class UpdateTrigger:
         if not group.majority_wants_update:
             self._wanted_since_s = None
             self._content_since_s = min(self._content_since_s, now_s)
-            if not group.lacking() and now_s >= self._content_since_s + _CONTENT_S:
-                self._n_in_vain = 0  # the last one has helped
         else:
             self._content_since_s = math.inf
             if self._wanted_since_s is None:
                 self._wanted_since_s = now_s
+        is_content = now_s >= self._content_since_s + _CONTENT_S
+        if self._shows_more() or (is_content and not group.lacking()):
+            self._n_in_vain = 0  # the last one has helped
         lost = [m for m in group.holders(self._revision) if self._revision and self._is_lost(m)]
         self._lost_since_s = {m: self._lost_since_s.get(m, now_s) for m in lost}
 
@@ -258,11 +262,32 @@ class UpdateTrigger:
         lost_s = self._options.lost_s
         return tuple(m for m, since_s in self._lost_since_s.items() if now_s >= since_s + lost_s)
 
+    def begun(self) -> None:
+        """Note that a round begins: what is seen now is what it has to improve on."""
+        members = self._group.holders(self._revision)
+        self._before = (self._revision, {m: self._tracked_by(m) for m in members})
+
     def ended(self, now_s: float) -> None:
         """Note the end of a round, whatever came of it; pauses grow until one has helped."""
         self._n_in_vain += 1
         self._ended_at_s = now_s
         self._wanted_since_s = None
+
+    def _shows_more(self) -> bool:
+        """Whether most members see clearly more of a new revision than before its round."""
+        if self._before is None or self._before[0] == self._revision:
+            return False
+        seen = self._before[1]
+        more = [
+            m
+            for m in self._group.holders(self._revision)
+            if m in seen and self._tracked_by(m) > max(_SEES_MORE * seen[m], self._options.tracked)
+        ]
+        return 2 * len(more) > len(self._group.alive)
+
+    def _tracked_by(self, member: int) -> int:
+        state = self._group.state_of(member)
+        return 0 if state is None else state.tracked
 
     def _is_lost(self, member: int) -> bool:
         state = self._group.state_of(member)

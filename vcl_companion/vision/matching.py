@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -44,15 +43,14 @@ def match_mutual(a: Features, b: Features, options: MatchOptions) -> tuple[Index
     """
     if len(a) < 2 or len(b) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    matcher = cv2.BFMatcher(_norm(a))
-    best, distance = _knn(matcher, a, b, 2)
-    clear = np.flatnonzero(distance[:, 0] < options.ratio * distance[:, 1])
+    best, distance, second = _nearest_of(a, b)
+    clear = np.flatnonzero(distance < options.ratio * second)
     if len(clear) == 0:
         return clear, clear
-    chosen, which = np.unique(best[clear, 0], return_inverse=True)
-    backward, _ = _knn(matcher, b.subset(chosen), a, 1)
-    mutual = backward[which, 0] == clear
-    return clear[mutual], best[clear[mutual], 0]
+    chosen, which = np.unique(best[clear], return_inverse=True)
+    backward, _, _ = _nearest_of(b.subset(chosen), a)
+    mutual = backward[which] == clear
+    return clear[mutual], best[clear[mutual]]
 
 
 def match_to_entries(
@@ -162,20 +160,14 @@ def _worst(features: Features) -> float:
     return 0.9
 
 
-def _norm(features: Features) -> int:
-    return cv2.NORM_HAMMING if features.descriptors.dtype == np.uint8 else cv2.NORM_L2
-
-
-def _knn(matcher: cv2.BFMatcher, a: Features, b: Features, k: int) -> tuple[Index, Array]:
-    """Return (N, k) indices into ``b`` and distances, padded by repeating the last."""
-    rows = matcher.knnMatch(a.descriptors, b.descriptors, k=min(k, len(b)))
-    index = np.array([[m.trainIdx for m in row] for row in rows], dtype=np.intp)
-    distance = np.array([[m.distance for m in row] for row in rows], dtype=np.float64)
-    missing = k - index.shape[1]
-    if missing > 0:
-        index = np.pad(index, ((0, 0), (0, missing)), mode="edge")
-        distance = np.pad(distance, ((0, 0), (0, missing)), mode="edge")
-    return index, distance
+def _nearest_of(a: Features, b: Features) -> tuple[Index, Array, Array]:
+    """Return (N,) the nearest of ``b`` to each of ``a``, its distance, and the next one's."""
+    everyone = np.arange(len(b))
+    if a.descriptors.dtype == np.uint8:
+        searched = hamming_index(_binary(b), everyone, divided=False)
+        nearest, distance, second = nearest_two(_binary(a), searched)
+        return nearest.astype(np.intp), distance.astype(float), second.astype(float)
+    return _nearest_two(a, b, everyone)
 
 
 def _nearest_two(features: Features, entries: Features, owner: Index) -> tuple[Index, Array, Array]:
