@@ -54,29 +54,60 @@ def test_golden_bytes() -> None:
     assert names_of_update(blob[:40]) == names_of_update(blob)
 
 
+def grown(rng: np.random.Generator, parent: LandmarkMap, n_new: int, n_views: int) -> LandmarkMap:
+    """The parent as a round leaves it: some of it culled and moved, some of it new."""
+    kept = np.sort(rng.permutation(len(parent.points_world))[: rng.integers(0, 40)])
+    stay = np.flatnonzero(rng.uniform(size=len(parent.keyframes)) < 0.8)
+    more = random_map(rng, len(kept) + n_new, len(stay) + max(n_views, 1 - len(stay)))
+    keyframes = tuple(parent.keyframes[k] for k in stay) + tuple(
+        replace(k, image_bytes=b"a new image" + k.image_bytes) for k in more.keyframes[len(stay) :]
+    )
+    sizes_px = np.array([(k.camera.width_px, k.camera.height_px) for k in keyframes])
+    observed_px = np.minimum(more.observed_px, sizes_px - 1)
+    old = parent.observed_px[np.ix_(kept, stay)].copy()
+    old[rng.uniform(size=old.shape[:2]) < 0.1] = np.nan
+    same = rng.uniform(size=old.shape[:2]) < 0.95
+    observed_px[: len(kept), : len(stay)][same] = old[same]
+    points = more.points_world.copy()
+    points[: len(kept)] = parent.points_world[kept] + 0.01 * rng.standard_normal((len(kept), 3))
+    return replace(
+        more, keyframes=keyframes, points_world=points, observed_px=observed_px, distances=(),
+        parent=revision_of(encode_map(parent)),
+    )  # fmt: skip
+
+
 @given(
-    st.integers(0, 2**32).map(np.random.default_rng), st.integers(0, 30), st.integers(1, 5),
-    st.integers(0, 3),
+    st.integers(0, 2**32).map(np.random.default_rng), st.integers(0, 40), st.integers(1, 5),
+    st.integers(0, 10), st.integers(0, 3),
 )  # fmt: skip
 def test_what_comes_out_is_what_went_in(
-    rng: np.random.Generator, n_landmarks: int, n_old: int, n_new: int
+    rng: np.random.Generator, n_landmarks: int, n_old: int, n_new: int, n_views: int
 ) -> None:
     parent = random_map(rng, n_landmarks, n_old)
-    parent = replace(
-        parent, keyframes=tuple(replace(k, image_bytes=rng.bytes(500)) for k in parent.keyframes)
+    images = [rng.bytes(500) for _ in parent.keyframes]
+    keyframes = tuple(
+        replace(k, image_bytes=image) for k, image in zip(parent.keyframes, images, strict=True)
     )
-    kept = [k for k in range(n_old) if rng.uniform() < 0.7]
-    more = random_map(rng, n_landmarks, max(n_new, 1))
-    keyframes = tuple(parent.keyframes[k] for k in kept) + tuple(
-        replace(k, image_bytes=b"new" + k.image_bytes) for k in more.keyframes
-    )
-    observed_px = np.full((n_landmarks, len(keyframes), 2), np.nan)
-    data = encode_map(
-        replace(more, keyframes=keyframes, observed_px=observed_px, parent=b"12345678")
-    )
+    parent = decode_map(encode_map(replace(parent, keyframes=keyframes)))
+    data = encode_map(grown(rng, parent, n_new, n_views))
     blob = encode_map_update(data, parent)
     assert decode_map_update(blob, parent, {}) == data
-    assert len(data) - len(blob) == 498 * len(kept) - 8
+    carried = {name_of_image(k.image_bytes): k.image_bytes for k in decode_map(data).keyframes}
+    bare = without_images(blob, carried)
+    assert decode_map_update(bare, parent, carried) == data
+
+
+def test_what_has_not_changed_costs_next_to_nothing() -> None:
+    rng = np.random.default_rng(5)
+    parent = decode_map(encode_map(random_map(rng, 1000, 6, seen_share=0.5)))
+    moved = parent.points_world + 0.01 * rng.standard_normal((1000, 3))
+    data = encode_map(replace(parent, points_world=moved, parent=b"12345678"))
+    heads = len(
+        encode_map(replace(parent, points_world=moved[:0], observed_px=parent.observed_px[:0]))
+    )
+    # 12 bits of each coordinate's step, and a bit of each sighting, of 22 and 40.
+    assert len(encode_map_update(data, parent)) - heads < 6000
+    assert len(data) - heads > 20_000
 
 
 def test_golden_bytes_for_one_who_holds_the_new_image() -> None:

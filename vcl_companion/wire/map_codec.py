@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 import struct
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -67,9 +68,61 @@ _KEYFRAME = struct.Struct("<BQ")
 
 # Then three columns x, y, z of N values in steps of 2^-16 m, then for every keyframe N bits
 # (seen there) and two columns u, v of its seen landmarks in steps of 2^-6 px from pixel -1.
-_STEPS_PER_M = 1 << 16
+STEPS_PER_M = 1 << 16
 _STEPS_PER_PX = 1 << 6
 _MARGIN_PX = 1.0  # a subpixel peak may lie a little outside of the image
+
+
+@dataclass(frozen=True, eq=False)
+class MapHead:
+    """What is in a map but its landmarks; the fields are those of ``LandmarkMap``."""
+
+    keyframes: tuple[Keyframe, ...]
+    n_landmarks: int
+    pixel_noise_px: float
+    detectors: tuple[str, ...]
+    distances: tuple[KnownDistance, ...]
+    parent: bytes
+
+    @classmethod
+    def of(cls, m: LandmarkMap) -> MapHead:
+        """Return a map's."""
+        n = len(m.points_world)
+        return cls(m.keyframes, n, m.pixel_noise_px, m.detectors, m.distances, m.parent)
+
+    def map_with(self, points: Integers, pixels: Integers) -> LandmarkMap:
+        """Return the map whose landmarks lie there.
+
+        Args:
+            points: (N, 3) steps of 2^-16 m.
+            pixels: (N, V, 2) steps of 2^-6 px, see ``steps_of_pixels``.
+
+        Raises:
+            ValueError: they are no landmarks.
+        """
+        return LandmarkMap(
+            keyframes=self.keyframes,
+            points_world=points / STEPS_PER_M,
+            observed_px=np.where(pixels < 0, np.nan, pixels / _STEPS_PER_PX - _MARGIN_PX),
+            pixel_noise_px=self.pixel_noise_px,
+            detectors=self.detectors,
+            distances=self.distances,
+            parent=self.parent,
+        )
+
+
+def steps_of_points(points_world: Array) -> Integers:
+    """Return (N, 3) points in steps of 2^-16 m."""
+    return np.rint(points_world * STEPS_PER_M).astype(np.int64)
+
+
+def steps_of_pixels(observed_px: Array) -> Integers:
+    """Return (..., 2) pixels in steps of 2^-6 px from pixel -1 on; -1 where there is none."""
+    seen = np.isfinite(observed_px)
+    if (seen[..., 0] != seen[..., 1]).any():
+        raise ValueError("an observation has only one of its two coordinates")
+    steps = np.rint((np.where(seen, observed_px, 0.0) + _MARGIN_PX) * _STEPS_PER_PX)
+    return np.where(seen, steps, -1).astype(np.int64)
 
 
 def revision_of(data: bytes) -> bytes:
@@ -97,17 +150,34 @@ def encode_map(landmark_map: LandmarkMap) -> bytes:
         ValueError: the map breaks a bound that peers hold every map to.
     """
     m = landmark_map
-    n_landmarks, n_keyframes = len(m.points_world), len(m.keyframes)
+    if len(m.points_world) and np.abs(m.points_world).max() > MAX_COORDINATE_M:
+        raise ValueError(f"a landmark lies further than {MAX_COORDINATE_M:.0f} m from the origin")
+    parts = [encode_header(BlobKind.MAP), encode_head(MapHead.of(m))]
+    points, pixels = steps_of_points(m.points_world), steps_of_pixels(m.observed_px)
+    parts += [encode_column(points[:, axis]) for axis in range(3)]
+    for i, keyframe in enumerate(m.keyframes):
+        seen = pixels[:, i, 0] >= 0
+        parts += [encode_bits(seen), encode_pixels(pixels[seen, i], keyframe)]
+    data = b"".join(parts)
+    if len(data) > MAX_BLOB_BYTES:
+        raise ValueError(f"a map of {len(data)} bytes, at most {MAX_BLOB_BYTES}")
+    return data
+
+
+def encode_head(m: MapHead) -> bytes:
+    """Return what goes before the landmarks of a map, without version and kind.
+
+    Raises:
+        ValueError: see ``encode_map``.
+    """
+    n_landmarks, n_keyframes = m.n_landmarks, len(m.keyframes)
     _check_counts(n_landmarks, n_keyframes, len(m.distances))
     detectors = sum(1 << bit for bit, name in enumerate(_DETECTORS) if name in m.detectors)
     if not m.detectors or not set(m.detectors) <= set(_DETECTORS):
         raise ValueError(f"detectors must be some of {', '.join(_DETECTORS)}: {m.detectors}")
     if len(m.parent) not in (0, REVISION_BYTES):
         raise ValueError(f"a parent revision has 0 or {REVISION_BYTES} bytes: {m.parent!r}")
-    if n_landmarks and np.abs(m.points_world).max() > MAX_COORDINATE_M:
-        raise ValueError(f"a landmark lies further than {MAX_COORDINATE_M:.0f} m from the origin")
     parts = [
-        encode_header(BlobKind.MAP),
         _HEAD.pack(
             detectors,
             len(m.parent),
@@ -125,15 +195,7 @@ def encode_map(landmark_map: LandmarkMap) -> bytes:
                 distance.keyframe_a, distance.keyframe_b, distance.distance_m, distance.sigma_m
             )
         )
-    parts += [_encode_keyframe(keyframe) for keyframe in m.keyframes]
-    points = np.rint(m.points_world * _STEPS_PER_M).astype(np.int64)
-    parts += [encode_column(points[:, axis]) for axis in range(3)]
-    for i, keyframe in enumerate(m.keyframes):
-        parts += _encode_observations(keyframe, m.observed_px[:, i])
-    data = b"".join(parts)
-    if len(data) > MAX_BLOB_BYTES:
-        raise ValueError(f"a map of {len(data)} bytes, at most {MAX_BLOB_BYTES}")
-    return data
+    return b"".join(parts + [_encode_keyframe(keyframe) for keyframe in m.keyframes])
 
 
 def decode_map(data: bytes) -> LandmarkMap:
@@ -148,36 +210,46 @@ def decode_map(data: bytes) -> LandmarkMap:
     if kind != BlobKind.MAP:
         raise WireError(f"not a map: blob kind {kind}")
     reader = Reader(data, "map", HEADER_BYTES)
+    try:
+        head = take_head(reader)
+        points = np.stack([take_column(reader, head.n_landmarks) for _ in range(3)], axis=1)
+        if head.n_landmarks and np.abs(points).max() > MAX_COORDINATE_M * STEPS_PER_M:
+            raise WireError("map: a landmark lies out of range")
+        pixels = np.full((head.n_landmarks, len(head.keyframes), 2), -1, dtype=np.int64)
+        for i, keyframe in enumerate(head.keyframes):
+            seen = take_bits(reader, head.n_landmarks)
+            pixels[seen, i] = take_pixels(reader, int(seen.sum()), keyframe)
+        reader.finish()
+        return head.map_with(points, pixels)
+    except ValueError as error:
+        raise WireError(f"map: {error}") from None
+
+
+def take_head(reader: Reader) -> MapHead:
+    """Return what comes before the landmarks of a map.
+
+    Raises:
+        WireError: the bytes are none.
+        ValueError: or are out of bounds.
+    """
     detectors, n_parent, n_keyframes, n_distances, n_landmarks, noise_px, parent = reader.unpack(
         _HEAD
     )
     if not 0 < detectors < 1 << len(_DETECTORS):
         raise WireError(f"map: unknown detectors {detectors:#x}")
     parent = _checked_parent(n_parent, parent)
-    try:
-        _check_counts(n_landmarks, n_keyframes, n_distances)
-        distances = tuple(KnownDistance(*reader.unpack(_DISTANCE)) for _ in range(n_distances))
-        for distance in distances:
-            _check_distance(distance)
-        keyframes = tuple(_take_keyframe(reader) for _ in range(n_keyframes))
-        points = np.stack([take_column(reader, n_landmarks) for _ in range(3)], axis=1)
-        if n_landmarks and np.abs(points).max() > MAX_COORDINATE_M * _STEPS_PER_M:
-            raise WireError("map: a landmark lies out of range")
-        observed_px = np.full((n_landmarks, n_keyframes, 2), np.nan)
-        for i, keyframe in enumerate(keyframes):
-            observed_px[:, i] = _take_observations(reader, keyframe, n_landmarks)
-        reader.finish()
-        return LandmarkMap(
-            keyframes=keyframes,
-            points_world=points / _STEPS_PER_M,
-            observed_px=observed_px,
-            pixel_noise_px=noise_px,
-            detectors=tuple(n for bit, n in enumerate(_DETECTORS) if detectors >> bit & 1),
-            distances=distances,
-            parent=parent,
-        )
-    except ValueError as error:
-        raise WireError(f"map: {error}") from None
+    _check_counts(n_landmarks, n_keyframes, n_distances)
+    distances = tuple(KnownDistance(*reader.unpack(_DISTANCE)) for _ in range(n_distances))
+    for distance in distances:
+        _check_distance(distance)
+    return MapHead(
+        tuple(_take_keyframe(reader) for _ in range(n_keyframes)),
+        n_landmarks,
+        noise_px,
+        tuple(n for bit, n in enumerate(_DETECTORS) if detectors >> bit & 1),
+        distances,
+        parent,
+    )
 
 
 def _checked_parent(n_bytes: int, padded: bytes) -> bytes:
@@ -217,29 +289,23 @@ def _take_keyframe(reader: Reader) -> Keyframe:
     )
 
 
-def _encode_observations(keyframe: Keyframe, observed_px: Array) -> list[bytes]:
-    """Return mask and columns of what one keyframe saw; (N, 2) px, NaN where not seen."""
-    finite = np.isfinite(observed_px)
-    seen = finite[:, 0] & finite[:, 1]
-    if (finite[:, 0] != finite[:, 1]).any():
-        raise ValueError("an observation has only one of its two coordinates")
-    steps = np.rint((observed_px[seen] + _MARGIN_PX) * _STEPS_PER_PX)
+def encode_pixels(steps: Integers, keyframe: Keyframe) -> bytes:
+    """Return two columns of (n, 2) steps that lie in a keyframe's image.
+
+    Raises:
+        ValueError: some do not.
+    """
     if len(steps) and (steps.min() < 0 or (steps > _largest_steps(keyframe)).any()):
         raise ValueError("an observation lies outside of its image")
-    columns = steps.astype(np.int64)
-    return [encode_bits(seen), encode_column(columns[:, 0]), encode_column(columns[:, 1])]
+    return encode_column(steps[:, 0]) + encode_column(steps[:, 1])
 
 
-def _take_observations(reader: Reader, keyframe: Keyframe, n_landmarks: int) -> Array:
-    """Return the (N, 2) pixels of one keyframe that come next, NaN where not seen."""
-    seen = take_bits(reader, n_landmarks)
-    n_seen = int(seen.sum())
-    steps = np.stack([take_column(reader, n_seen), take_column(reader, n_seen)], axis=1)
-    if n_seen and (steps.min() < 0 or (steps > _largest_steps(keyframe)).any()):
+def take_pixels(reader: Reader, n: int, keyframe: Keyframe) -> Integers:
+    """Return the (n, 2) steps in a keyframe's image that come next, or raise WireError."""
+    steps = np.stack([take_column(reader, n), take_column(reader, n)], axis=1)
+    if n and (steps.min() < 0 or (steps > _largest_steps(keyframe)).any()):
         raise WireError("map: an observation lies outside of its image")
-    observed_px = np.full((n_landmarks, 2), np.nan)
-    observed_px[seen] = steps / _STEPS_PER_PX - _MARGIN_PX
-    return observed_px
+    return steps
 
 
 def _largest_steps(keyframe: Keyframe) -> Integers:

@@ -1,8 +1,9 @@
-"""A map for one who has its parent: the images that are known there stay at home.
+"""A map for one who has its parent: what is known there stays at home.
 
 Images are nearly all of a map. An update keeps most of its parent's, and the others
-may have been sent ahead, while the map was being built. What comes out of decoding is
-the whole map's bytes, proven by its revision.
+may have been sent ahead, while the map was being built; of the landmarks it tells what
+has changed (``map_delta``). What comes out of decoding is the whole map's bytes,
+proven by its revision.
 """
 
 from __future__ import annotations
@@ -17,17 +18,21 @@ from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.wire.header import HEADER_BYTES, BlobKind, decode_header, encode_header
 from vcl_companion.wire.map_codec import (
     REVISION_BYTES,
+    MapHead,
     decode_map,
+    encode_head,
     encode_map,
     parent_of,
     revision_of,
+    take_head,
 )
+from vcl_companion.wire.map_delta import encode_landmarks, take_landmarks
 from vcl_companion.wire.reader import Reader
 
 # | 2  | 8 bytes | revision of the whole map                                        |
-# | 10 | rest    | the whole map's bytes from its offset 2 on, but an image of two  |
+# | 10 | rest    | the whole map's head from its offset 2 on, but an image of two   |
 # |    |         | bytes is a u16: the parent's keyframe whose image it is; one of  |
-# |    |         | eight bytes names an image that was sent ahead                   |
+# |    |         | eight bytes names an image that was sent ahead; then map_delta   |
 _PLACE = struct.Struct("<H")
 _NAME_BYTES = 8
 
@@ -38,7 +43,7 @@ def name_of_image(image_bytes: bytes) -> bytes:
 
 
 def encode_map_update(data: bytes, parent: LandmarkMap) -> bytes:
-    """Return the bytes of a map without the images of its parent.
+    """Return the bytes of a map without what its parent has.
 
     Args:
         data: the whole map, encoded.
@@ -49,16 +54,16 @@ def encode_map_update(data: bytes, parent: LandmarkMap) -> bytes:
         ValueError: it has an image that is taken for a reference.
     """
     whole = decode_map(data)
-    places = {keyframe.image_bytes: k for k, keyframe in enumerate(parent.keyframes)}
+    place_of = {keyframe.image_bytes: k for k, keyframe in enumerate(parent.keyframes)}
+    places = [place_of.get(keyframe.image_bytes) for keyframe in whole.keyframes]
     keyframes = []
-    for keyframe in whole.keyframes:
-        place = places.get(keyframe.image_bytes)
+    for keyframe, place in zip(whole.keyframes, places, strict=True):
         if place is None and _is_reference(keyframe):
             raise ValueError(f"an image of {len(keyframe.image_bytes)} bytes is none")
         image = keyframe.image_bytes if place is None else _PLACE.pack(place)
         keyframes.append(replace(keyframe, image_bytes=image))
-    bare = encode_map(replace(whole, keyframes=tuple(keyframes)))
-    return encode_header(BlobKind.MAP_UPDATE) + revision_of(data) + bare[HEADER_BYTES:]
+    head = encode_head(replace(MapHead.of(whole), keyframes=tuple(keyframes)))
+    return _joined(revision_of(data), head + encode_landmarks(whole, parent, places))
 
 
 def images_in_update(update: bytes) -> frozenset[bytes]:
@@ -67,8 +72,8 @@ def images_in_update(update: bytes) -> frozenset[bytes]:
     Raises:
         WireError: the bytes are no update.
     """
-    _, bare = _split(update)
-    keyframes = decode_map(bare).keyframes
+    _, reader = _split(update)
+    keyframes = _head_of(reader).keyframes
     return frozenset(name_of_image(k.image_bytes) for k in keyframes if not _is_reference(k))
 
 
@@ -78,15 +83,15 @@ def without_images(update: bytes, held: Collection[bytes]) -> bytes:
     Raises:
         WireError: the bytes are no update.
     """
-    revision, bare = _split(update)
-    whole = decode_map(bare)
+    revision, reader = _split(update)
+    head = _head_of(reader)
     keyframes = []
-    for keyframe in whole.keyframes:
+    for keyframe in head.keyframes:
         name = name_of_image(keyframe.image_bytes)
         stays = not _is_reference(keyframe) and name in held
         keyframes.append(replace(keyframe, image_bytes=name) if stays else keyframe)
-    bare = encode_map(replace(whole, keyframes=tuple(keyframes)))
-    return encode_header(BlobKind.MAP_UPDATE) + revision + bare[HEADER_BYTES:]
+    head = replace(head, keyframes=tuple(keyframes))
+    return _joined(revision, encode_head(head) + reader.rest())
 
 
 def names_of_update(blob: bytes) -> tuple[bytes, bytes]:
@@ -95,8 +100,8 @@ def names_of_update(blob: bytes) -> tuple[bytes, bytes]:
     Raises:
         WireError: the bytes do not begin like one.
     """
-    revision, bare = _split(blob)
-    return revision, parent_of(bare)
+    revision, reader = _split(blob)
+    return revision, parent_of(encode_header(BlobKind.MAP) + reader.rest())
 
 
 def decode_map_update(blob: bytes, parent: LandmarkMap, held: Mapping[bytes, bytes]) -> bytes:
@@ -111,40 +116,66 @@ def decode_map_update(blob: bytes, parent: LandmarkMap, held: Mapping[bytes, byt
         WireError: the bytes are no update, or not one of this parent, or need an
             image that is not held.
     """
-    revision, bare = _split(blob)
-    update = decode_map(bare)
-    keyframes = tuple(_with_image(keyframe, parent, held) for keyframe in update.keyframes)
+    revision, reader = _split(blob)
+    head = _head_of(reader)
+    places = [_place(keyframe, parent) for keyframe in head.keyframes]
+    keyframes = tuple(
+        replace(k, image_bytes=_image(k, place, parent, held))
+        for k, place in zip(head.keyframes, places, strict=True)
+    )
     try:
-        data = encode_map(replace(update, keyframes=keyframes))
-    except ValueError as error:  # the images make it longer than peers accept
+        whole = take_landmarks(reader, replace(head, keyframes=keyframes), parent, places)
+        reader.finish()
+        data = encode_map(whole)
+    except ValueError as error:  # the images may make it longer than peers accept
         raise WireError(f"map update: {error}") from None
     if revision_of(data) != revision:
-        raise WireError("map update: with our images it is another map")
+        raise WireError("map update: with what we have it is another map")
     return data
 
 
-def _split(blob: bytes) -> tuple[bytes, bytes]:
-    """Return the revision and the bytes that remain, as those of a map."""
+def _joined(revision: bytes, rest: bytes) -> bytes:
+    return encode_header(BlobKind.MAP_UPDATE) + revision + rest
+
+
+def _split(blob: bytes) -> tuple[bytes, Reader]:
+    """Return the revision, and what reads the rest."""
     kind = decode_header(blob)
     if kind != BlobKind.MAP_UPDATE:
         raise WireError(f"not a map update: blob kind {kind}")
-    revision = Reader(blob, "map update", HEADER_BYTES).take(REVISION_BYTES)
-    return revision, encode_header(BlobKind.MAP) + blob[HEADER_BYTES + REVISION_BYTES :]
+    reader = Reader(blob, "map update", HEADER_BYTES)
+    return reader.take(REVISION_BYTES), reader
+
+
+def _head_of(reader: Reader) -> MapHead:
+    try:
+        return take_head(reader)
+    except ValueError as error:
+        raise WireError(f"map update: {error}") from None
 
 
 def _is_reference(keyframe: Keyframe) -> bool:
     return len(keyframe.image_bytes) in (_PLACE.size, _NAME_BYTES)
 
 
-def _with_image(keyframe: Keyframe, parent: LandmarkMap, held: Mapping[bytes, bytes]) -> Keyframe:
-    if not _is_reference(keyframe):
-        return keyframe
-    if len(keyframe.image_bytes) == _NAME_BYTES:
-        image = held.get(keyframe.image_bytes)
-        if image is None:
-            raise WireError("map update: an image that was sent ahead is not here")
-        return replace(keyframe, image_bytes=image)
-    (place,) = _PLACE.unpack(keyframe.image_bytes)
+def _place(keyframe: Keyframe, parent: LandmarkMap) -> int | None:
+    """Return which of the parent's keyframes it is; None for a new one."""
+    if len(keyframe.image_bytes) != _PLACE.size:
+        return None
+    place = int(_PLACE.unpack(keyframe.image_bytes)[0])
     if place >= len(parent.keyframes):
         raise WireError(f"map update: there is no keyframe {place} in its parent")
-    return replace(keyframe, image_bytes=parent.keyframes[place].image_bytes)
+    return place
+
+
+def _image(
+    keyframe: Keyframe, place: int | None, parent: LandmarkMap, held: Mapping[bytes, bytes]
+) -> bytes:
+    if place is not None:
+        return parent.keyframes[place].image_bytes
+    if not _is_reference(keyframe):
+        return keyframe.image_bytes
+    image = held.get(keyframe.image_bytes)
+    if image is None:
+        raise WireError("map update: an image that was sent ahead is not here")
+    return image

@@ -29,6 +29,10 @@ class Reader:
         """Return the fields of ``layout`` from the next bytes."""
         return layout.unpack(self.take(layout.size))
 
+    def rest(self) -> bytes:
+        """Return all that has not been taken, and leave it."""
+        return self._data[self._at :]
+
     def finish(self) -> None:
         """Raise unless every byte was taken."""
         if self._at != len(self._data):
