@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import socket
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,6 +16,7 @@ from sitl.frame_server import FrameServer
 from tests.daemon import demo
 from tests.daemon.autopilot import Autopilot, autopilot_and_link
 from tests.daemon.waiting import beside, until
+from tests.ports import free_ports
 from vcl_companion.cameras.source import Frame
 from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import ManualClock
@@ -60,17 +60,6 @@ COMPANION = 197
 INTER = InterMavOptions(detector="akaze")
 NO_UPDATES = UpdateOptions(tracked=0, share=0.0)
 FAST = TransferOptions(rate_bytes_per_s=5e6, status_interval_s=0.05)
-
-
-def free_ports(n: int) -> list[int]:
-    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(n)]
-    try:
-        for s in sockets:
-            s.bind(("127.0.0.1", 0))
-        return [int(s.getsockname()[1]) for s in sockets]
-    finally:
-        for s in sockets:
-            s.close()
 
 
 class Drone:

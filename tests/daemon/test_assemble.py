@@ -19,7 +19,7 @@ import pytest
 
 from sitl.daemon_config import toml_text
 from tests.daemon import demo
-from tests.daemon.swarm import free_ports
+from tests.ports import free_ports
 from vcl_companion.mapping.warm_up import warm_up
 from vcl_companion.recording import Description, RecordingWriter
 

@@ -58,6 +58,33 @@ def test_outside_the_nearest_is_held_within_the_age_only() -> None:
     assert ours.at(899 * MS + OFFSET_NS, OFFSET_NS) is None
 
 
+def test_shortly_after_two_samples_it_turns_on_as_before() -> None:
+    ours = history()
+    ours.add(sample(1000 * MS), 0)
+    assert not ours.covers(1010 * MS + OFFSET_NS, OFFSET_NS)
+    ours.add(sample(1020 * MS), 0)
+    for ahead_ms in (1, 15, 25):
+        at_ns = 1020 * MS + ahead_ms * MS
+        assert ours.covers(at_ns + OFFSET_NS, OFFSET_NS)
+        carried = ours.at(at_ns + OFFSET_NS, OFFSET_NS)
+        assert carried is not None
+        assert carried.at_ns == at_ns + OFFSET_NS
+        assert angle(carried.ned_from_body, true_at(at_ns - MS // 2)) < 1e-9
+    late_ns = 1047 * MS + OFFSET_NS
+    assert not ours.covers(late_ns, OFFSET_NS)
+    held = ours.at(late_ns, OFFSET_NS)
+    assert held is not None
+    np.testing.assert_array_equal(held.ned_from_body, true_at(1020 * MS))
+
+
+def test_it_turns_on_no_longer_than_from_one_sample_to_the_next() -> None:
+    ours = history()
+    ours.add(sample(1000 * MS), 0)
+    ours.add(sample(1004 * MS), 0)
+    assert ours.covers(1009 * MS + OFFSET_NS, OFFSET_NS)
+    assert not ours.covers(1010 * MS + OFFSET_NS, OFFSET_NS)
+
+
 def test_a_gap_is_not_bridged() -> None:
     ours = history()
     ours.add(sample(1000 * MS), 0)

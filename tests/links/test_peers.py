@@ -1,29 +1,18 @@
 """Peer links among themselves, and against strangers, on loopback."""
 
 import asyncio
-import socket
 
 import pytest
 
 from tests.links import wire
 from tests.links.running import running, udp
+from tests.ports import free_ports
 from vcl_companion.errors import ConfigError
 from vcl_companion.links.mavlink import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions
 
 MEMBERS = frozenset({1, 2, 3})
 PAYLOAD_TYPE = 40000
-
-
-def free_ports(n: int) -> list[int]:
-    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(n)]
-    try:
-        for s in sockets:
-            s.bind(("127.0.0.1", 0))
-        return [int(s.getsockname()[1]) for s in sockets]
-    finally:
-        for s in sockets:
-            s.close()
 
 
 class Drone:

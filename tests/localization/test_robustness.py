@@ -202,8 +202,9 @@ def test_who_is_where_the_wrong_landmarks_say_finds_out_when_there_is_time_to_do
 
     def found(prior: Prior, may_doubt: bool) -> Localized:
         fix = localize(
-            image, PINHOLE, MOUNTING, index, templates, prior, None, options, Effort(may_doubt)
-        )
+            image, PINHOLE, MOUNTING, index, templates, prior, None, options,
+            Effort(may_doubt=may_doubt),
+        )  # fmt: skip
         assert isinstance(fix, Localized), fix.reason
         return fix
 

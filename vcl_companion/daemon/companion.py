@@ -202,7 +202,11 @@ class Companion:
             predicted.prior() if predicted else None,
             ned_from_body,
             self._options,
-            Effort(may_search, now_s >= self._doubted_at_s + _DOUBT_EVERY_S, may_fall_back),
+            Effort(
+                may_search=may_search,
+                may_doubt=now_s >= self._doubted_at_s + _DOUBT_EVERY_S,
+                may_fall_back=may_fall_back,
+            ),
         )
         if isinstance(fix, Localized) and is_doubtful(fix):
             self._doubted_at_s = now_s

@@ -89,11 +89,10 @@ class PassedFrames:
             raise WireError("a frame passed on, but not by the coordinator")
         frame = decode_frame(blob, BlobKind.PASSED_FRAME)
         self.keep(frame.image_bytes)
-        if not self._new.full():
-            self._new.put_nowait(frame)
+        self._look_at(frame)
 
     async def run(self) -> None:
-        """Find the features of what has come, before the map needs them, until cancelled."""
+        """Find the features of what goes round, before the map needs them, until cancelled."""
         loop = asyncio.get_running_loop()
         while True:
             frame = await self._new.get()
@@ -113,6 +112,7 @@ class PassedFrames:
 
     def pass_on(self, frame: FrameAnswer) -> None:
         """Send a frame of a round to every member that neither took it nor coordinates."""
+        self._look_at(frame)
         name = name_of_image(frame.image_bytes)
         blob = b""
         for peer in self._group.alive:
@@ -151,6 +151,10 @@ class PassedFrames:
         for there in self._peers.values():
             self._stop(there)
         self._peers.clear()
+
+    def _look_at(self, frame: FrameAnswer) -> None:
+        if not self._new.full():
+            self._new.put_nowait(frame)
 
     def _stop(self, there: _AtPeer | None) -> None:
         for transfer_id in there.on_their_way if there is not None else ():

@@ -12,6 +12,8 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from vcl_companion.geometry.rotation import Array, exp_so3, log_so3
 from vcl_companion.links.mavlink import AttitudeSample
 
@@ -22,6 +24,10 @@ _MAX_SAMPLES = 1024
 # A stamp this much earlier than the last is a restart, less is a datagram overtaken.
 _REBOOT_MS = 1000
 _ARRIVALS = 128
+# Who turns goes on turning for so long, and no longer than from one sample to the next: a
+# frame need not wait for the sample after it. At 2 rad/s^2 that is wrong by 0.04 degrees.
+_CARRIED_NS = 25_000_000
+_CARRIED_STEPS = 1.25
 
 Taken = Literal["taken", "overtaken", "rebooted"]
 
@@ -33,7 +39,7 @@ class Attitude:
     Attributes:
         ned_from_body: (3, 3) rotation.
         at_ns: our clock. It is the instant asked for when samples lie on both
-            sides of it, else the instant of the nearest sample.
+            sides of it or shortly before it, else the instant of the nearest sample.
     """
 
     ned_from_body: Array
@@ -92,8 +98,15 @@ class AttitudeHistory:
         return bool(self._samples) and self._newest_ns(offset_ns) >= at_ns - self._max_age_ns
 
     def covers(self, at_ns: int, offset_ns: int) -> bool:
-        """Return whether a sample at or after ``at_ns`` has come, as far as stamps can tell."""
-        return bool(self._samples) and self._newest_ns(offset_ns) + _CUT_OFF_NS >= at_ns
+        """Return whether what has come tells of ``at_ns``, as far as stamps can tell.
+
+        A sample at or after it does, and so do two shortly before it.
+        """
+        if not self._samples:
+            return False
+        if self._newest_ns(offset_ns) + _CUT_OFF_NS >= at_ns:
+            return True
+        return self._carried(at_ns, offset_ns) is not None
 
     def at(self, at_ns: int, offset_ns: int) -> Attitude | None:
         """Return the attitude at an instant.
@@ -103,9 +116,9 @@ class AttitudeHistory:
             offset_ns: our clock minus the autopilot's.
 
         Returns:
-            interpolated on the arc between the samples around it, or the nearest
-            sample when all are on one side; None when the nearest is further away
-            than the allowed age.
+            interpolated on the arc between the samples around it, or carried on from
+            two shortly before it, or the nearest sample when all are on one side;
+            None when the nearest is further away than the allowed age.
         """
         index = bisect.bisect_left(
             self._samples, at_ns, key=lambda sample: self._measured_ns(sample) + offset_ns
@@ -115,10 +128,25 @@ class AttitudeHistory:
         if not around or min(abs(at_ns - time) for time in times) > self._max_age_ns:
             return None
         if len(around) == 1:
+            carried = self._carried(at_ns, offset_ns)
+            if carried is not None:
+                return Attitude(carried, at_ns)
             return Attitude(around[0].ned_from_body, times[0])
         before, after = (sample.ned_from_body for sample in around)
         fraction = (at_ns - times[0]) / (times[1] - times[0])
         return Attitude(before @ exp_so3(fraction * log_so3(before.T @ after)), at_ns)
+
+    def _carried(self, at_ns: int, offset_ns: int) -> Array | None:
+        """Return (3, 3) the attitude shortly after the newest sample, turning on as before."""
+        if len(self._samples) < 2:
+            return None
+        before, last = self._samples[-2], self._samples[-1]
+        step_ns = self._measured_ns(last) - self._measured_ns(before)
+        ahead_ns = at_ns - self._newest_ns(offset_ns)
+        if not 0 <= ahead_ns <= min(_CARRIED_NS, _CARRIED_STEPS * step_ns):
+            return None
+        turned = log_so3(before.ned_from_body.T @ last.ned_from_body)
+        return np.asarray(last.ned_from_body @ exp_so3(ahead_ns / step_ns * turned))
 
     def _newest_ns(self, offset_ns: int) -> int:
         return self._measured_ns(self._samples[-1]) + offset_ns

@@ -46,7 +46,7 @@ class PipelineOptions:
     tracking: TrackingOptions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Effort:
     """What may be tried that takes as long as several frames.
 
