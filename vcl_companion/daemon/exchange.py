@@ -166,6 +166,7 @@ class Exchange:
             maps,
             log,
             executor,
+            hosting,
             self._tell_state,
             self._refusals.count,
             options.detectors,

@@ -69,6 +69,7 @@ class MapSharing:
         maps: the current map.
         log: told of every map flown on.
         executor: runs decoding, indexing and writing.
+        hosting: runs indexing by the other detectors, so that no map waits for it.
         tell_state: tells peers which map we fly on.
         refuse: counts what a peer sent in vain: peer, kind, detail.
         detectors: the localization's own, and what it falls back on.
@@ -87,6 +88,7 @@ class MapSharing:
         maps: MapStore,
         log: FlightLog,
         executor: Executor,
+        hosting: Executor,
         tell_state: Callable[[], None],
         refuse: Callable[[int, str, str], None],
         detectors: tuple[Detector, ...],
@@ -101,6 +103,7 @@ class MapSharing:
         self._maps = maps
         self._log = log
         self._executor = executor
+        self._hosting = hosting
         self._tell_state = tell_state
         self._refuse = refuse
         self._detectors = detectors
@@ -318,19 +321,20 @@ class MapSharing:
         It takes as long as the map itself, and most revisions are never asked about.
         """
         loop = asyncio.get_running_loop()
+        memory = FeatureMemory(self._features)  # one thread's, like the other one
         done = b""
         while True:
             stored = await self._maps.more_wanted()
             if stored.revision == done or not self._detectors[1:]:
                 continue
             index = await loop.run_in_executor(
-                self._executor,
+                self._hosting,
                 with_fallbacks,
                 stored.index,
                 self._detectors[1:],
                 self._features,
-                self._memory,
+                memory,
             )
             done = stored.revision
             self._maps.improve(stored, index)
-            await loop.run_in_executor(self._executor, give_back_freed)
+            await loop.run_in_executor(self._hosting, give_back_freed)
