@@ -335,7 +335,7 @@ def test_rounds_that_show_more_for_a_moment_only_stay_frequent() -> None:
         sky.run(1.4)  # in fast flight what was gained is soon out of sight
     pauses = np.diff([at_s for at_s, _ in sky.begun]) - sky.round_s
     assert len(pauses) == 4
-    assert (pauses < OPTIONS.interval_s + 1.0).all()
+    assert (pauses < 3.0).all()  # up to eight intervals where nothing helps
 
 
 def judged(sights: list[Sight]) -> bool:

@@ -34,9 +34,10 @@ _STILL_COVERED = 0.8
 # An update that did not help is followed by a longer pause, up to so many intervals.
 _MAX_PAUSE = 8.0
 # An update has helped when the majority sees so many times what it saw before, or wants none
-# for so long, s: in fast flight the next one is wanted sooner.
+# for so long, s: a new map that is no better is found out in 0.5 s, and in fast flight the
+# next one is wanted after two.
 _SEES_MORE = 1.3
-_CONTENT_S = 2.0
+_CONTENT_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ class UpdateOptions:
     sigma_m: float = 0.005
     sigma_growth: float = 1.5
     hold_s: float = 0.5
-    interval_s: float = 2.0
+    interval_s: float = 1.0
     gather_timeout_s: float = 5.0
     delivery_wait_s: float = 30.0
     lost_s: float = 3.0
