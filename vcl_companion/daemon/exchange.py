@@ -199,6 +199,8 @@ class Exchange:
             hosting,
             options.features,
             options.inter,
+            options.detectors,
+            tries_all=options.tracked,
         )
         self._vote = OwnVote(options.update)
         self._wants_update = False

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import suppress
 
@@ -30,7 +30,7 @@ from vcl_companion.localization.pose_filter import FilterState
 from vcl_companion.mapping.drone_view import decode_image
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.pose_requests import InterMavOptions
-from vcl_companion.vision.features import FeatureOptions, Features, detect
+from vcl_companion.vision.features import Detector, FeatureOptions, Features, Image, detect
 from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.pose_messages import (
     PoseProposal,
@@ -42,7 +42,7 @@ from vcl_companion.wire.pose_messages import (
 _log = logging.getLogger(__name__)
 
 # Several targets ask about the same moment: our own features of it are found once.
-_N_KEPT = 3
+_N_KEPT = 6
 # Our own frame of that moment may be being looked at right now.
 _SETTLE_S = 0.5
 # The map may have to be indexed by our detector first, behind an update that is being built.
@@ -63,6 +63,9 @@ class InterHost:
         executor: runs the vision, beside our own frames'.
         features: how they are found.
         options: thresholds.
+        indexed_by: detectors that the daemon indexes its maps by, some only when asked to.
+        tries_all: whether every index that there is is tried before the request is refused;
+            else only that by ``options.detector``, which is waited for: the paper's way.
     """
 
     def __init__(
@@ -77,6 +80,9 @@ class InterHost:
         executor: Executor,
         features: FeatureOptions,
         options: InterMavOptions,
+        indexed_by: tuple[Detector, ...],
+        *,
+        tries_all: bool,
     ) -> None:
         self._maps = maps
         self._frames = frames
@@ -85,7 +91,10 @@ class InterHost:
         self._refuse = refuse
         self._clock = clock
         self._executor = executor
-        self._look = _Look(sensor, features, options)
+        self._look = _Look(sensor, features, options, indexed_by, tries_all)
+        self._detector = options.detector
+        self._is_made = options.detector in indexed_by
+        self._tries_all = tries_all
         self._requests: PeerMailbox[tuple[int, bytes]] = PeerMailbox()
 
     def offer(self, peer: int, blob: bytes) -> None:
@@ -127,7 +136,7 @@ class InterHost:
         stored = await self._indexed(stored)
         loop = asyncio.get_running_loop()
         try:
-            return await loop.run_in_executor(
+            said = await loop.run_in_executor(
                 self._executor, self._look.from_frame, *own, stored, request.frame
             )
         except ValueError as error:
@@ -136,10 +145,13 @@ class InterHost:
             # Peers' images and numbers went in: none of them may end the flight.
             _log.exception("a pose request cannot be worked on")
             return NoProposal(f"looking failed: {type(error).__name__}")
+        if isinstance(said, NoProposal) and _index_by(self._detector, stored) is None:
+            self._maps.want_more()  # it will be asked again
+        return said
 
     async def _indexed(self, stored: StoredMap) -> StoredMap:
-        """Return the map with an index by our detector, if the daemon makes one soon."""
-        if self._look.known_index(stored) is not None:
+        """Return the map, with an index by our detector if that is wanted and made in time."""
+        if self._tries_all or not self._is_made or _index_by(self._detector, stored) is not None:
             return stored
         self._maps.want_more()
         with suppress(TimeoutError):
@@ -161,15 +173,32 @@ class InterHost:
         return None
 
 
+def _index_by(detector: Detector, stored: StoredMap) -> MapIndex | None:
+    """Return a map's index by a detector, if there is one."""
+    known: MapIndex | None = stored.index
+    while known is not None and known.detector != detector:
+        known = known.fallback
+    return known
+
+
 class _Look:
     """The vision of it; used by the executor's one thread only."""
 
-    def __init__(self, sensor: Sensor, features: FeatureOptions, options: InterMavOptions) -> None:
+    def __init__(
+        self,
+        sensor: Sensor,
+        features: FeatureOptions,
+        options: InterMavOptions,
+        indexed_by: tuple[Detector, ...],
+        tries_all: bool,
+    ) -> None:
         self._sensor = sensor
         self._features = features
         self._options = options
+        self._is_made = options.detector in indexed_by
+        self._tries_all = tries_all
         self._index: tuple[bytes, MapIndex] | None = None
-        self._own: deque[tuple[int, Features]] = deque(maxlen=_N_KEPT)
+        self._own: deque[tuple[int, Detector, Features]] = deque(maxlen=_N_KEPT)
 
     def from_frame(
         self, frame: Frame, state: FilterState, stored: StoredMap, seen: FrameAnswer
@@ -187,48 +216,59 @@ class _Look:
                 nothing that our detector finds.
         """
         image = decode_image(seen.image_bytes, seen.camera)
+        said: Proposal | NoProposal = NoProposal("the map is not indexed for peers yet")
+        for index in self._indexes(stored):
+            said = self._by_index(frame, state, index, seen, image)
+            if isinstance(said, Proposal):
+                break
+        return said
+
+    def _by_index(
+        self,
+        frame: Frame,
+        state: FilterState,
+        index: MapIndex,
+        seen: FrameAnswer,
+        image: Image,
+    ) -> Proposal | NoProposal:
+        """Propose it by one detector."""
         host = Observer(
-            self._own_features(frame),
+            self._own_features(frame, index.detector),
             self._sensor.camera,
             self._sensor.body_from_cam,
             state.ned_from_body,
         )
         attitude = seen.ned_from_body
         target = Observer(
-            detect(image, self._options.detector, self._features),
+            detect(image, index.detector, self._features),
             seen.camera,
             seen.body_from_cam,
             None if attitude is None else matrix_from_quaternion(attitude),
         )
-        return localize_inter(
-            host,
-            state.world_from_body,
-            state.pose_covariance(),
-            target,
-            self._index_of(stored),
-            self._options,
-        )
+        pose, covariance = state.world_from_body, state.pose_covariance()
+        return localize_inter(host, pose, covariance, target, index, self._options)
 
-    def _own_features(self, frame: Frame) -> Features:
-        for sequence, features in self._own:
-            if sequence == frame.sequence:
+    def _own_features(self, frame: Frame, detector: Detector) -> Features:
+        for sequence, by, features in self._own:
+            if (sequence, by) == (frame.sequence, detector):
                 return features
-        found = detect(np.asarray(frame.image), self._options.detector, self._features)
-        self._own.append((frame.sequence, found))
+        found = detect(np.asarray(frame.image), detector, self._features)
+        self._own.append((frame.sequence, detector, found))
         return found
 
-    def known_index(self, stored: StoredMap) -> MapIndex | None:
-        """Return the map's index by our detector, if there is one."""
+    def _indexes(self, stored: StoredMap) -> Iterator[MapIndex]:
+        """Yield the indexes to try, the cheapest first."""
         known: MapIndex | None = stored.index
-        while known is not None and known.detector != self._options.detector:
+        while known is not None:
+            if self._tries_all or known.detector == self._options.detector:
+                yield known
             known = known.fallback
-        if known is None and self._index is not None and self._index[0] == stored.revision:
-            return self._index[1]
-        return known
+        if not self._is_made:
+            yield self._own_index(stored)
 
-    def _index_of(self, stored: StoredMap) -> MapIndex:
-        known = self.known_index(stored)
-        if known is None:
-            known = index_map(stored.index.landmark_map, self._options.detector, self._features)
-            self._index = (stored.revision, known)
-        return known
+    def _own_index(self, stored: StoredMap) -> MapIndex:
+        """Return the index by a detector that nobody else in this daemon uses."""
+        if self._index is None or self._index[0] != stored.revision:
+            index = index_map(stored.index.landmark_map, self._options.detector, self._features)
+            self._index = (stored.revision, index)
+        return self._index[1]
