@@ -122,7 +122,7 @@ def encoded_update() -> bytes:
     """The next revision of the map of 1 and 2, with a later frame of all three."""
     stored = StoredMap(revision_of(encoded_map(1, 2)), encoded_map(1, 2), map_index(1, 2))
     frames = [answer(system_id, 12) for system_id in (1, 2, 3)]
-    made = update_map(stored, frames, MAP_OPTIONS, FeatureMemory(FEATURES))
+    made = update_map(stored, frames, MAP_OPTIONS, FeatureMemory(FEATURES), at_once=False)
     assert isinstance(made, LandmarkMap)
     return encode_map(made)
 

@@ -48,21 +48,19 @@ def test_everybody_is_tried_then_the_surest_and_the_others_in_turn() -> None:
     assert choice.choose(MAP, 1) == [2]  # back, and a new one
 
 
-def test_who_was_less_sure_of_us_than_we_are_is_asked_again_half_a_minute_later() -> None:
+def test_only_who_was_surer_of_us_lately_may_know_better() -> None:
     choice, second = HostChoice(group_of(1, 2)), 10**9
-    assert choice.may_know_better(MAP, 0.2, 0)  # never asked
-    assert not choice.may_know_better(MAP, 0.02, 0)  # nobody knows others so well
-    assert not choice.may_know_better(OTHER, 0.2, 0)  # nobody flies on it
-    choice.answered(1, 0.3, 0)
+    assert not choice.may_know_better(MAP, 0.2, 0)  # never asked
+    choice.answered(1, 0.1, 0)
     choice.answered(2, math.inf, 5 * second)
-    assert not choice.may_know_better(MAP, 0.2, 29 * second)
-    assert choice.may_know_better(MAP, 0.4, 29 * second)
-    assert choice.may_know_better(MAP, 0.2, 31 * second)
-    choice.answered(1, 0.3, 31 * second)
-    assert not choice.may_know_better(MAP, 0.2, 34 * second)
-    assert choice.may_know_better(MAP, 0.2, 36 * second)  # the other one, by then
+    assert choice.may_know_better(MAP, 0.2, 29 * second)
+    assert not choice.may_know_better(OTHER, 0.2, 29 * second)  # nobody flies on it
+    assert not choice.may_know_better(MAP, 0.02, 29 * second)
+    assert not choice.may_know_better(MAP, 0.2, 31 * second)
     choice.answered(2, 0.01, 36 * second)
     assert choice.may_know_better(MAP, 0.02, 37 * second)
+    choice.lost(2)
+    assert not choice.may_know_better(MAP, 0.02, 37 * second)
 
 
 @pytest.mark.parametrize(

@@ -51,14 +51,18 @@ def update_map(
     frames: list[FrameAnswer],
     map_options: MapOptions,
     memory: FeatureMemory,
+    *,
+    at_once: bool,
 ) -> LandmarkMap | NoMap:
-    """Build the next revision of a map of a round's frames (IV-G); takes some seconds.
+    """Build the next revision of a map of a round's frames (IV-G).
 
     Args:
         stored: the map in use.
         frames: of each drone that answered, several of some.
         map_options: thresholds.
         memory: finds features.
+        at_once: of the frames only that show the map where their drones say; takes a
+            second, the others many.
 
     Returns:
         A map whose parent is ``stored``, or why there is none. A frame whose
@@ -74,6 +78,7 @@ def update_map(
         map_options,
         pyramid_of=memory.pyramid,
         sure=stored.index.uncertainty,
+        at_once=at_once,
     )
 
 

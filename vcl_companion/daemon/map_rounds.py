@@ -183,15 +183,12 @@ class MapRounds:
             await self._decide(built, None, request_id)
 
     async def _next_revision(self, stored: StoredMap, frame: Frame) -> None:
-        options, update = self._options, self._options.update
+        update = self._options.update
         lost = self._trigger.lost(self._now_s())
         reason = f"wanted by drones {_listed(self._group.wanting_update)}"
         reason += f"; {_listed(lost)} lost" if lost else ""
         self._log.event("update", reason)
         _log.info("the map is updated, %s", reason)
-
-        def build(frames: list[FrameAnswer]) -> LandmarkMap | NoMap:
-            return update_map(stored, frames, options.map, options.memory)
 
         request_id = self._gathering.begin()
         wanted = Wanted(
@@ -206,12 +203,52 @@ class MapRounds:
             frames = await self._gathered(frame, wanted, lambda: self._is_past(stored))
         finally:
             self._is_updating = False
-        built = await self._built(frames, build)
+        await self._extend(stored, frames, lost, request_id)
+
+    async def _extend(
+        self,
+        stored: StoredMap,
+        frames: list[FrameAnswer] | NoMap,
+        lost: tuple[int, ...],
+        request_id: int,
+    ) -> None:
+        """Make the next revision of what shows the map; then one of what lost drones show.
+
+        These wait, for their features are looked for all over the map: who flies on must not.
+        """
+        if isinstance(frames, list) and self._options.map.patches:
+            built = await self._updated(stored, frames, at_once=True)
+            if isinstance(built, LandmarkMap):
+                # Who is no more the coordinator has no say any more, and a map that came is newer.
+                if self._is_past(stored):
+                    return
+                await self._decide(built, stored, request_id)
+                shown = {(k.drone_id, k.captured_at_ns) for k in built.keyframes}
+                frames = [
+                    f
+                    for f in frames
+                    if (f.drone_id in lost or f.world_from_body is None)
+                    and (f.drone_id, f.captured_at_ns) not in shown
+                ]
+                current = self._maps.current
+                if not frames or current is None:
+                    return
+                stored = current
+        built = await self._updated(stored, frames, at_once=False)
         if isinstance(built, NoMap):
             self._passed.over()
-        # Who is no more the coordinator has no say any more, and a map that came is newer.
         if not self._is_past(stored):
             await self._decide(built, stored, request_id)
+
+    async def _updated(
+        self, stored: StoredMap, frames: list[FrameAnswer] | NoMap, *, at_once: bool
+    ) -> LandmarkMap | NoMap:
+        options = self._options
+
+        def build(frames: list[FrameAnswer]) -> LandmarkMap | NoMap:
+            return update_map(stored, frames, options.map, options.memory, at_once=at_once)
+
+        return await self._built(frames, build)
 
     def _is_past(self, stored: StoredMap) -> bool:
         """Whether a round that began with a map has come too late."""

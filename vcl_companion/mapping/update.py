@@ -77,19 +77,26 @@ def extended(
     seed: int = 0,
     pyramid_of: PyramidOf = decoded_pyramid,
     sure: MapUncertainty | None = None,
+    *,
+    at_once: bool = False,
 ) -> LandmarkMap | NoMap:
     """Do what ``extend_map`` does, with any source of features, images and uncertainty.
 
     Views that say where they are are joined by patches. Those that do not, or are not
-    there, are registered by their features, on what the others have made of the map.
+    there, are registered by their features, on what the others have made of the map:
+    that takes many times as long, and ``at_once`` does without it.
     """
     known = {(k.drone_id, k.captured_at_ns) for k in old.keyframes}
     views = [v for v in views if (v.drone_id, v.captured_at_ns) not in known]
+    if at_once:
+        views = [v for v in views if v.world_from_body is not None]
     if not views:
         return NoMap("there is no view that the map does not have already")
     try:
         sure = sure or map_uncertainty(old)
-        growth = _grown(old, sure, views, features_of, options, seed, pyramid_of, MutualMatches())
+        growth = _grown(
+            old, sure, views, features_of, options, seed, pyramid_of, MutualMatches(), at_once
+        )
     except ValueError as error:
         return NoMap(str(error))
     if isinstance(growth, NoMap):
@@ -110,6 +117,7 @@ def _grown(
     seed: int,
     pyramid_of: PyramidOf,
     matches: MutualMatches,
+    at_once: bool,
 ) -> Growth | NoMap:
     """Join views by patches, then the others by features on what came of it.
 
@@ -120,6 +128,8 @@ def _grown(
     if options.patches:
         views = _guessed(old, sure, views, features_of, options, seed, matches)
         growth = Extension(old, sure, views, features_of, pyramid_of, options).run()
+    if at_once:
+        return growth or NoMap("no view joins the map by its patches")
     if growth is None:
         return _by_features(old, sure, views, features_of, options, seed, pyramid_of, matches)
     waiting = [v for i, v in enumerate(views) if i not in growth.views]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from vcl_companion.localization.pair_evidence import InterOptions
@@ -54,8 +55,6 @@ class InterMavOptions(InterOptions):
 
 # What peers knew so long ago tells no more whether they know better than we do.
 _REMEMBERED_S = 30.0
-# Who has not been asked lately is taken to be so sure of others.
-_USUAL_M = 0.1
 
 
 class HostChoice:
@@ -87,26 +86,23 @@ class HostChoice:
         return chosen
 
     def may_know_better(self, revision: bytes, sigma_m: float, at_ns: int) -> bool:
-        """Whether a peer was surer of us than we are, or may well be when it is asked.
+        """Whether a peer was surer of us lately than we are now.
 
         Args:
             revision: of our map.
             sigma_m: of our position, in its worst direction.
             at_ns: now, in the time of ``answered``.
         """
-        return any(self._known_m(peer, at_ns) < sigma_m for peer in self._able(revision))
+        return any(
+            self._sigma_m.get(peer, math.inf) < sigma_m
+            and at_ns - self._told_at_ns[peer] <= _REMEMBERED_S * 1e9
+            for peer in self._able(revision)
+        )
 
     def answered(self, peer: int, sigma_m: float, at_ns: int) -> None:
         """Note how sure an answer was; infinite for a peer that could not tell."""
         self._sigma_m[peer] = sigma_m
         self._told_at_ns[peer] = at_ns
-
-    def _known_m(self, peer: int, at_ns: int) -> float:
-        """Return how sure a peer was of us lately, m, or what is usual."""
-        told_at_ns = self._told_at_ns.get(peer)
-        if told_at_ns is None or at_ns - told_at_ns > _REMEMBERED_S * 1e9:
-            return _USUAL_M
-        return self._sigma_m[peer]
 
     def _able(self, revision: bytes) -> list[int]:
         """Return the peers that are localized in a map."""
