@@ -154,7 +154,6 @@ class Sky:
             if self.now_s >= member.round_ends_at_s:
                 self._finish(member)
         elif member.trigger.is_due(self.now_s):
-            member.trigger.begun()
             self.begun.append((self.now_s, own_id))
             self.begun_alone.append(member.group.alive == (own_id,))
             member.round_ends_at_s = self.now_s + self.round_s

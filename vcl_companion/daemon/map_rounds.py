@@ -134,7 +134,6 @@ class MapRounds:
                 await self._first_map(frame)
             elif stored is not None and self._trigger.is_due(self._now_s()):
                 tried = frame
-                self._trigger.begun()
                 await self._next_revision(stored, frame)
                 self._trigger.ended(self._now_s())
             else:

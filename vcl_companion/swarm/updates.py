@@ -225,7 +225,9 @@ class UpdateTrigger:
         self._ended_at_s = -math.inf
         self._n_in_vain = 0
         self._content_since_s = math.inf
-        self._before: tuple[bytes, dict[int, int]] | None = None
+        self._told: dict[int, tuple[bytes, int]] = {}
+        self._before: dict[int, int] = {}
+        self._helped = b""
 
     def poll(self, now_s: float) -> None:
         """Look at the group; call it several times a second."""
@@ -239,9 +241,12 @@ class UpdateTrigger:
             self._content_since_s = math.inf
             if self._wanted_since_s is None:
                 self._wanted_since_s = now_s
+        self._note_tracked()
         is_content = now_s >= self._content_since_s + _CONTENT_S
-        if self._shows_more() or (is_content and not group.lacking()):
+        if is_content and not group.lacking():
             self._n_in_vain = 0  # the last one has helped
+        elif self._helped != self._revision and self._shows_more():
+            self._n_in_vain, self._helped = 0, self._revision
         lost = [m for m in group.holders(self._revision) if self._revision and self._is_lost(m)]
         self._lost_since_s = {m: self._lost_since_s.get(m, now_s) for m in lost}
 
@@ -263,32 +268,33 @@ class UpdateTrigger:
         lost_s = self._options.lost_s
         return tuple(m for m, since_s in self._lost_since_s.items() if now_s >= since_s + lost_s)
 
-    def begun(self) -> None:
-        """Note that a round begins: what is seen now is what it has to improve on."""
-        members = self._group.holders(self._revision)
-        self._before = (self._revision, {m: self._tracked_by(m) for m in members})
-
     def ended(self, now_s: float) -> None:
         """Note the end of a round, whatever came of it; pauses grow until one has helped."""
         self._n_in_vain += 1
         self._ended_at_s = now_s
         self._wanted_since_s = None
 
+    def _note_tracked(self) -> None:
+        """Remember what every member saw last on the map that it has left."""
+        for member in self._group.alive:
+            state = self._group.state_of(member)
+            if state is None:
+                continue
+            revision, tracked = self._told.get(member, (state.revision, 0))
+            if revision != state.revision:
+                self._before[member] = tracked
+            self._told[member] = (state.revision, state.tracked)
+
     def _shows_more(self) -> bool:
-        """Whether most members see clearly more of a new revision than before its round."""
-        if self._before is None or self._before[0] == self._revision:
-            return False
-        seen = self._before[1]
+        """Whether most members see clearly more of the newest revision than of the last."""
         more = [
-            m
-            for m in self._group.holders(self._revision)
-            if m in seen and self._tracked_by(m) > max(_SEES_MORE * seen[m], self._options.tracked)
+            member
+            for member, (revision, tracked) in self._told.items()
+            if revision == self._revision
+            and member in self._before
+            and tracked > max(_SEES_MORE * self._before[member], self._options.tracked)
         ]
         return 2 * len(more) > len(self._group.alive)
-
-    def _tracked_by(self, member: int) -> int:
-        state = self._group.state_of(member)
-        return 0 if state is None else state.tracked
 
     def _is_lost(self, member: int) -> bool:
         state = self._group.state_of(member)
