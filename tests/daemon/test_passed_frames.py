@@ -91,7 +91,7 @@ def test_only_the_coordinator_s_frames_are_held_and_only_so_many() -> None:
         three.frames.take(1, encode_frame(frame_of(2, b"of two")))
     three.frames.take(1, blob)
     assert three.frames.held[name_of_image(b"of two")] == b"of two"
-    three.frames.keep(b"my own")
+    three.frames.given(frame_of(3, b"my own"))
     for n in range(100):
         three.frames.take(1, encode_frame(frame_of(2, b"%d" % n), BlobKind.PASSED_FRAME))
     assert len(three.frames.held) == 16

@@ -142,7 +142,7 @@ class Exchange:
             executor,
             partial(self._hand, BlobKind.FRAME_ANSWER),
             transfers.cancel,
-            self._passed.keep,
+            self._passed.given,
             options.map.keyframe_quality,
         )
         self._rounds = MapRounds(

@@ -62,7 +62,7 @@ class FrameAnswers:
         executor: runs the encoding.
         hand: sends an answer to a peer; returns the transfer's id.
         cancel: ends a transfer, one that is over already too.
-        given: told of every image that is given to a peer.
+        given: told of every frame that is given to a peer.
         keyframe_quality: of the images, 1 to 100.
     """
 
@@ -78,7 +78,7 @@ class FrameAnswers:
         executor: Executor,
         hand: Callable[[int, bytes], int],
         cancel: Callable[[int], None],
-        given: Callable[[bytes], None],
+        given: Callable[[FrameAnswer], None],
         keyframe_quality: int,
     ) -> None:
         self._system_id = system_id
@@ -135,7 +135,7 @@ class FrameAnswers:
             return None
         answer = await self.describe(frame, wanted.request_id)
         blob = encode_frame(answer)
-        self._note_given(answer.image_bytes)
+        self._note_given(answer)
         self._given.pop(peer, None)
         self._given[peer] = _Given(wanted.request_id, blob)
         if len(self._given) > _MAX_ASKERS:

@@ -26,8 +26,8 @@ from vcl_companion.mapping.options import NoMap
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.transfer import BlobKind, Transfers
 from vcl_companion.vision.features import Detector, FeatureOptions
-from vcl_companion.wire.map_codec import encode_map
-from vcl_companion.wire.map_update import images_in_update, without_images
+from vcl_companion.wire.map_codec import encode_map, revision_of
+from vcl_companion.wire.map_update import encode_map_update, images_in_update, without_images
 
 _log = logging.getLogger(__name__)
 
@@ -37,6 +37,8 @@ _HAND_AGAIN_S = 10.0
 _TAKE_IN_S = 20.0
 # What was delivered in vain is not likely to be of use the next time: ever more rarely.
 _HAND_AGAIN_AT_MOST_S = 120.0
+# A coordinator that we see on the map before ours has made ours: it is about to follow.
+_FOLLOWS_S = 5.0
 # A map that was refused may come again after this: we may know better by then.
 _LOOK_AGAIN_S = 5.0
 
@@ -49,6 +51,16 @@ class _Handed:
     transfer_id: int
     n_delivered: int
     again_at_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class _HandOut:
+    """A map to be handed out; the fields are those of ``StoredMap``."""
+
+    revision: bytes
+    parent: bytes
+    data: bytes
+    update: bytes
 
 
 @dataclass(frozen=True)
@@ -115,6 +127,7 @@ class MapSharing:
         self._offered: PeerMailbox[MapOffer] = PeerMailbox()
         self._handed: dict[int, _Handed] = {}
         self._update: _Update | None = None
+        self._ahead: _HandOut | None = None  # ours is not ready yet, peers may have it
         self._behind_since_s: float | None = None  # the coordinator, as far as known
 
     def offer(self, peer: int, kind: BlobKind, blob: bytes) -> None:
@@ -167,7 +180,7 @@ class MapSharing:
             self._reject(peer, offer, why_not)
 
     async def adopt(self, built: LandmarkMap, instead_of: StoredMap | None) -> NoMap | None:
-        """Fly on a map of our own, exactly as peers will decode it.
+        """Fly on a map of our own, exactly as peers will decode it, and hand it out meanwhile.
 
         Args:
             built: a first map, or a revision of the one in use.
@@ -178,10 +191,12 @@ class MapSharing:
         """
         loop = asyncio.get_running_loop()
         try:
-            data = await loop.run_in_executor(self._executor, encode_map, built)
+            self._ahead = await loop.run_in_executor(self._executor, _encoded, built, instead_of)
+            ready = await self._prepared(MapOffer.of(BlobKind.MAP, self._ahead.data))
         except ValueError as error:
             return NoMap(str(error))
-        ready = await self._prepared(MapOffer.of(BlobKind.MAP, data))
+        finally:
+            self._ahead = None
         if isinstance(ready, NoMap):
             return ready
         if self._maps.is_in_use(instead_of):
@@ -190,7 +205,10 @@ class MapSharing:
 
     def hand_out(self, now_s: float) -> None:
         """Send the map to those who lack it: as coordinator, or to a coordinator without one."""
-        stored = self._maps.current
+        current = self._maps.current
+        stored = self._ahead
+        if stored is None and current is not None:
+            stored = _hand_out_of(current)
         if stored is None:
             return
         if not self._coordinator_is_behind():
@@ -216,7 +234,7 @@ class MapSharing:
             )
 
     def _form_for(
-        self, peer: int, stored: StoredMap, n_delivered: int
+        self, peer: int, stored: _HandOut, n_delivered: int
     ) -> tuple[BlobKind, bytes] | None:
         """Return what to send: without the images that a peer has, unless that was in vain.
 
@@ -239,9 +257,10 @@ class MapSharing:
     def _lacking(self, revision: bytes) -> list[int]:
         group = self._group
         if group.is_coordinator:
-            return [peer for peer in group.lacking() if peer != group.own_id]
+            there = group.holders(revision)
+            return [peer for peer in group.peers if peer in group.alive and peer not in there]
         state = group.state_of(group.coordinator)
-        if state is None or (state.revision and not self._coordinator_is_behind()):
+        if state is None or (state.revision and not self._has_been_behind(_FOLLOWS_S)):
             return []
         is_first_holder = group.holders(revision)[:1] == (group.own_id,)
         return [group.coordinator] if is_first_holder else []
@@ -251,6 +270,11 @@ class MapSharing:
         state = self._group.state_of(self._group.coordinator)
         is_other = not self._group.is_coordinator
         return is_other and state is not None and self._maps.has_left(state.revision)
+
+    def _has_been_behind(self, for_s: float) -> bool:
+        """Whether the coordinator has been on a map that we have left for so long."""
+        now_s = asyncio.get_running_loop().time()
+        return self._behind_since_s is not None and now_s >= self._behind_since_s + for_s
 
     def _why_not(self, peer: int, offer: MapOffer) -> str | None:
         """Return why we do not fly on a peer's map, or None if we do.
@@ -267,10 +291,7 @@ class MapSharing:
                 return None
         if peer != group.coordinator:
             return "map, but not from the coordinator"
-        since_s = self._behind_since_s
-        now_s = asyncio.get_running_loop().time()
-        has_its_way = since_s is not None and now_s >= since_s + self._delivery_wait_s
-        if self._maps.has_left(offer.revision) and not has_its_way:
+        if self._maps.has_left(offer.revision) and not self._has_been_behind(self._delivery_wait_s):
             return "map that was left"
         return None
 
@@ -338,3 +359,18 @@ class MapSharing:
             done = stored.revision
             self._maps.improve(stored, index)
             await loop.run_in_executor(self._hosting, give_back_freed)
+
+
+def _hand_out_of(stored: StoredMap) -> _HandOut:
+    return _HandOut(stored.revision, stored.parent, stored.data, stored.update)
+
+
+def _encoded(built: LandmarkMap, parent: StoredMap | None) -> _HandOut:
+    """Return a map of our own as peers get it.
+
+    Raises:
+        ValueError: the map breaks a bound that peers hold every map to.
+    """
+    data = encode_map(built)
+    update = encode_map_update(data, parent.index.landmark_map) if parent is not None else b""
+    return _HandOut(revision_of(data), built.parent, data, update)

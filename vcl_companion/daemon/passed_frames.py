@@ -71,8 +71,12 @@ class PassedFrames:
         """Images that are here, by their names."""
         return self._held
 
-    def keep(self, image_bytes: bytes) -> None:
-        """Hold an image of our own, as it was given to a peer."""
+    def given(self, frame: FrameAnswer) -> None:
+        """Hold the image of a frame of our own, as it was given to a peer."""
+        self._keep(frame.image_bytes)
+        self._look_at(frame)
+
+    def _keep(self, image_bytes: bytes) -> None:
         name = name_of_image(image_bytes)
         self._held.pop(name, None)
         self._held[name] = image_bytes  # the last one is the last to go
@@ -88,7 +92,7 @@ class PassedFrames:
         if peer != self._group.coordinator:
             raise WireError("a frame passed on, but not by the coordinator")
         frame = decode_frame(blob, BlobKind.PASSED_FRAME)
-        self.keep(frame.image_bytes)
+        self._keep(frame.image_bytes)
         self._look_at(frame)
 
     async def run(self) -> None:
