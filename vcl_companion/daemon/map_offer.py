@@ -26,12 +26,14 @@ class MapOffer:
         blob: its bytes.
         revision: what it calls itself; proven when it is read.
         parent: what it was made from; empty for a first map.
+        update: the same for one who has its parent, if that is encoded already.
     """
 
     kind: BlobKind
     blob: bytes
     revision: bytes
     parent: bytes
+    update: bytes = b""
 
     @classmethod
     def of(cls, kind: BlobKind, blob: bytes) -> MapOffer:
@@ -90,7 +92,9 @@ def ready_map(
         data = decode_map_update(offer.blob, parent, held)
 
     index = _indexed(decode_map(data), detector, features, memory)
-    update = b"" if parent is None else encode_map_update(data, parent)
+    update = offer.update
+    if parent is not None and not update:
+        update = encode_map_update(data, parent)
     templates = prepare_templates(index.landmark_map, index.uncertainty) if tracked else None
     return ReadyMap(data, index, update, templates)
 

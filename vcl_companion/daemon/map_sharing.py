@@ -192,7 +192,8 @@ class MapSharing:
         loop = asyncio.get_running_loop()
         try:
             self._ahead = await loop.run_in_executor(self._executor, _encoded, built, instead_of)
-            ready = await self._prepared(MapOffer.of(BlobKind.MAP, self._ahead.data))
+            offer = MapOffer.of(BlobKind.MAP, self._ahead.data)
+            ready = await self._prepared(replace(offer, update=self._ahead.update))
         except ValueError as error:
             return NoMap(str(error))
         finally:
