@@ -80,5 +80,6 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path) -> None:
             assert drone["localized_share"] == 1.0
             assert drone["rmse_3d_cm"] < 10.0
     assert rotate["unfused"]["drones"]["mav0"]["estimates"]["inter"] == 0
-    assert rotate["fused"]["drones"]["mav0"]["estimates"]["inter"] > 0
+    # It may ask, and does not: nobody is surer of it than it is.
+    assert rotate["fused"]["drones"]["mav0"]["estimates"]["inter"] == 0
     assert (out / "paper.html").stat().st_size > 50_000
