@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import threading
 from collections import Counter
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
@@ -56,6 +57,7 @@ class Flight:
     history: FrameHistory
     log: FlightLog
     path: Path
+    executor: ThreadPoolExecutor
 
     def give(self, k: int, sequence: int | None = None, north_turned_rad: float = 0.0) -> None:
         """Hand out the k-th picture, and its attitude before it."""
@@ -79,10 +81,11 @@ class Flight:
         patches = demo.templates(*ids)
         self.maps.replace(demo.encoded_map(*ids), demo.map_index(*ids), templates=patches)
 
-    def fly_on_nothing_known(self) -> None:
+    def fly_on_nothing_known(self, tracked: bool = False) -> None:
         """On a map in which no feature is recognised."""
         index = demo.unrecognisable(demo.map_index(1, 2, 3))
-        self.maps.replace(demo.encoded_map(1, 2), index)
+        patches = demo.templates(1, 2, 3) if tracked else None
+        self.maps.replace(demo.encoded_map(1, 2), index, templates=patches)
 
     def end_stream(self, k: int) -> None:
         self.server.say_end(demo.shot(DRONE, k).at_ns)
@@ -153,6 +156,7 @@ async def flight(
             history,
             log,
             path / "log",
+            executor,
         )
 
 
@@ -335,6 +339,33 @@ def test_a_newer_frame_ends_the_wait_for_the_next_map(tmp_path: Path) -> None:
             assert first == 0
             assert outcome in ("refused", "dropped")
             assert second == (1, "localized", None)
+
+    run(scenario())
+
+
+def test_a_search_in_vain_that_kept_a_frame_waiting_leaves_time_for_others(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_nothing_known(tracked=True)
+            busy = threading.Event()
+            up.executor.submit(busy.wait)
+            up.give(0)
+            await until(lambda: up.history.newest is not None)
+            up.give(1)
+            # It waits now, and will when the search for the first one is over.
+            await until(lambda: up.history.newest is not None and up.history.newest.sequence == 1)
+            busy.set()
+            await up.server.answered()
+            (_, _, searched), (_, outcome, paused) = up.frames()
+            assert outcome == "refused"
+            assert paused == "lost, and looked for in vain a moment ago"
+            assert searched
+            assert searched != paused
+            # Another map is searched at once.
+            up.fly_on_a_map()
+            up.give(2)
+            await up.server.answered()
+            assert up.frames()[-1] == (2, "localized", None)
 
     run(scenario())
 

@@ -19,7 +19,7 @@ from vcl_companion.localization.intra import (
     Recognised,
 )
 from vcl_companion.localization.map_index import index_map
-from vcl_companion.localization.pipeline import PipelineOptions, localize
+from vcl_companion.localization.pipeline import Effort, PipelineOptions, localize
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.vision.features import Image
 
@@ -103,6 +103,20 @@ def test_what_one_detector_does_not_recognise_another_may() -> None:
             demo.templates(1, 2, 3), None, shot.ned_from_body.rotation, OPTIONS,
         )  # fmt: skip
         assert isinstance(fix, Localized) == recognised
+
+
+def test_without_time_for_a_search_patches_are_followed_and_nothing_is_looked_for() -> None:
+    shot, sensor = demo.shot(DRONE, FRAME), demo.sensor(DRONE)
+    hasty = Effort(may_search=False)
+    for expected in (prior(), None):
+        fix = localize(
+            shot.image, sensor.camera, sensor.body_from_cam, demo.map_index(1, 2, 3),
+            demo.templates(1, 2, 3), expected, shot.ned_from_body.rotation, OPTIONS, hasty,
+        )  # fmt: skip
+        if expected is not None:
+            found(fix, "patches")
+        else:
+            assert fix == NotLocalized("lost, and looked for in vain a moment ago")
 
 
 def test_the_paper_s_pipeline_finds_features_only() -> None:
