@@ -198,3 +198,11 @@ def test_of_any_bytes_a_parent_or_a_wire_error(body: bytes, head: bytes) -> None
     except WireError:
         return
     assert len(parent) in (0, 8)
+
+
+def test_an_observation_left_of_or_above_its_image_is_not_taken_for_none() -> None:
+    for pixel in ((-1.5, 10.0), (10.0, -1.5), (-1.5, -1.5)):
+        observed_px = small_map().observed_px.copy()
+        observed_px[0, 0] = pixel
+        with pytest.raises(ValueError, match="outside of its image"):
+            encode_map(replace(small_map(), observed_px=observed_px))

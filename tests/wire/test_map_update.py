@@ -13,8 +13,21 @@ from tests.wire.golden import assert_golden
 from tests.wire.samples import random_map, small_map
 from vcl_companion.errors import WireError
 from vcl_companion.mapping.landmark_map import LandmarkMap
-from vcl_companion.wire.header import PROTOCOL_VERSION, VersionMismatchError
-from vcl_companion.wire.map_codec import decode_map, encode_map, parent_of, revision_of
+from vcl_companion.wire.header import (
+    PROTOCOL_VERSION,
+    BlobKind,
+    VersionMismatchError,
+    encode_header,
+)
+from vcl_companion.wire.map_codec import (
+    MapHead,
+    decode_map,
+    encode_head,
+    encode_map,
+    parent_of,
+    revision_of,
+)
+from vcl_companion.wire.map_delta import encode_landmarks
 from vcl_companion.wire.map_update import (
     decode_map_update,
     encode_map_update,
@@ -181,3 +194,14 @@ def test_another_version_and_another_kind_are_recognised(decode: object) -> None
         decode(bytes([PROTOCOL_VERSION + 1]) + blob[1:])
     with pytest.raises(WireError, match="not a map update"):
         decode(CHILD)
+
+
+def test_many_references_to_a_large_image_are_refused_before_they_are_joined() -> None:
+    large = replace(PARENT.keyframes[0], image_bytes=bytes(1024 * 1024))
+    parent = replace(PARENT, keyframes=(large, PARENT.keyframes[1]))
+    many = tuple(replace(large, captured_at_ns=k, image_bytes=b"\0\0") for k in range(20))
+    observed_px = np.full((3, 20, 2), np.nan)
+    child = replace(PARENT, keyframes=many, observed_px=observed_px, distances=())
+    blob = encode_header(BlobKind.MAP_UPDATE) + b"revision" + encode_head(MapHead.of(child))
+    with pytest.raises(WireError, match="20971520 bytes of images"):
+        decode_map_update(blob + encode_landmarks(child, parent, [0] * 20), parent, {})

@@ -399,6 +399,7 @@ class Exchange:
                 self._forgot(event.peer)
                 self._tell_state()
             else:
+                self._passed.forgot(event.peer)
                 self.inter.lost(event.peer)
 
     def _now_s(self) -> float:

@@ -213,7 +213,8 @@ class MapRounds:
     ) -> None:
         """Make the next revision of what shows the map; then one of what lost drones show.
 
-        These wait, for their features are looked for all over the map: who flies on must not.
+        The latter takes long, for their features are looked for all over the map: who flies
+        on has its revision before.
         """
         if isinstance(frames, list) and self._options.map.patches:
             built = await self._updated(stored, frames, at_once=True)
@@ -233,11 +234,20 @@ class MapRounds:
                 if not frames or current is None:
                     return
                 stored = current
+                await self._delivered(stored)
+        if self._is_past(stored):
+            return
         built = await self._updated(stored, frames, at_once=False)
         if isinstance(built, NoMap):
             self._passed.over()
         if not self._is_past(stored):
             await self._decide(built, stored, request_id)
+
+    async def _delivered(self, stored: StoredMap) -> None:
+        """Wait until everybody alive has a revision, as long as a round would."""
+        until_s = self._now_s() + self._options.update.delivery_wait_s
+        while self._group.lacking() and not self._is_past(stored) and self._now_s() < until_s:
+            await asyncio.sleep(_LOOK_S)
 
     async def _updated(
         self, stored: StoredMap, frames: list[FrameAnswer] | NoMap, *, at_once: bool

@@ -192,10 +192,15 @@ class MapSharing:
         loop = asyncio.get_running_loop()
         try:
             self._ahead = await loop.run_in_executor(self._executor, _encoded, built, instead_of)
+        except (WireError, ValueError) as error:
+            return NoMap(str(error))
+        except Exception as error:
+            # Peers' images and numbers went into it: none of them may end the flight.
+            _log.exception("a map cannot be encoded")
+            return NoMap(f"encoding it failed: {type(error).__name__}")
+        try:
             offer = MapOffer.of(BlobKind.MAP, self._ahead.data)
             ready = await self._prepared(replace(offer, update=self._ahead.update))
-        except ValueError as error:
-            return NoMap(str(error))
         finally:
             self._ahead = None
         if isinstance(ready, NoMap):
@@ -344,10 +349,10 @@ class MapSharing:
         """
         loop = asyncio.get_running_loop()
         memory = FeatureMemory(self._features)  # one thread's, like the other one
-        done = b""
+        done: StoredMap | None = None
         while True:
             stored = await self._maps.more_wanted()
-            if stored.revision == done or not self._detectors[1:]:
+            if stored is done or not self._detectors[1:]:
                 continue
             index = await loop.run_in_executor(
                 self._hosting,
@@ -357,8 +362,9 @@ class MapSharing:
                 self._features,
                 memory,
             )
-            done = stored.revision
             self._maps.improve(stored, index)
+            if self._maps.is_in_use(stored):
+                done = self._maps.current
             await loop.run_in_executor(self._hosting, give_back_freed)
 
 

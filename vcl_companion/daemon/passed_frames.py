@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -23,15 +24,15 @@ from vcl_companion.wire.map_update import name_of_image
 
 _log = logging.getLogger(__name__)
 
-# Two rounds of eight drones, forty kilobytes each.
-_N_HELD = 16
+# Forty kilobytes each; and what a sender takes a peer to hold, which has its own among them.
+_N_HELD, _N_KNOWN_HELD = 48, 40
 
 
 @dataclass
 class _AtPeer:
     """Names of the images that a peer holds, and of those on their way, by transfer."""
 
-    held: set[bytes] = field(default_factory=set)
+    held: deque[bytes] = field(default_factory=lambda: deque(maxlen=_N_KNOWN_HELD))
     on_their_way: dict[int, bytes] = field(default_factory=dict)
 
 
@@ -124,7 +125,7 @@ class PassedFrames:
                 continue
             there = self._peers.setdefault(peer, _AtPeer())
             if peer == frame.drone_id:
-                there.held.add(name)
+                there.held.append(name)
             elif name not in there.held and name not in there.on_their_way.values():
                 blob = blob or encode_frame(frame, BlobKind.PASSED_FRAME)
                 there.on_their_way[self._hand(peer, blob)] = name
@@ -134,7 +135,7 @@ class PassedFrames:
         there = self._peers.get(peer)
         name = None if there is None else there.on_their_way.pop(transfer_id, None)
         if there is not None and name is not None and delivered:
-            there.held.add(name)
+            there.held.append(name)
 
     def held_by(self, peer: int) -> frozenset[bytes]:
         """Return the names of the images that a peer holds."""

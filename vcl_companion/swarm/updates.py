@@ -236,14 +236,15 @@ class UpdateTrigger:
             self._revision, self._revision_since_s = group.newest_revision, now_s
         if not group.majority_wants_update:
             self._wanted_since_s = None
-            self._content_since_s = min(self._content_since_s, now_s)
-        else:
+        elif self._wanted_since_s is None:
+            self._wanted_since_s = now_s
+        # Who does not have the newest revision has not judged it.
+        if group.majority_wants_update or group.lacking():
             self._content_since_s = math.inf
-            if self._wanted_since_s is None:
-                self._wanted_since_s = now_s
+        else:
+            self._content_since_s = min(self._content_since_s, now_s)
         self._note_tracked()
-        is_content = now_s >= self._content_since_s + _CONTENT_S
-        if is_content and not group.lacking():
+        if now_s >= self._content_since_s + _CONTENT_S:
             self._n_in_vain = 0  # the last one has helped
         elif self._helped != self._revision and self._shows_more():
             self._n_in_vain, self._helped = 0, self._revision
@@ -292,6 +293,7 @@ class UpdateTrigger:
             for member, (revision, tracked) in self._told.items()
             if revision == self._revision
             and member in self._before
+            and member in self._group.alive
             and tracked > max(_SEES_MORE * self._before[member], self._options.tracked)
         ]
         return 2 * len(more) > len(self._group.alive)

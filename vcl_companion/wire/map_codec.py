@@ -117,11 +117,17 @@ def steps_of_points(points_world: Array) -> Integers:
 
 
 def steps_of_pixels(observed_px: Array) -> Integers:
-    """Return (..., 2) pixels in steps of 2^-6 px from pixel -1 on; -1 where there is none."""
+    """Return (..., 2) pixels in steps of 2^-6 px from pixel -1 on; -1 where there is none.
+
+    Raises:
+        ValueError: an observation has one of its coordinates only, or lies before that.
+    """
     seen = np.isfinite(observed_px)
     if (seen[..., 0] != seen[..., 1]).any():
         raise ValueError("an observation has only one of its two coordinates")
     steps = np.rint((np.where(seen, observed_px, 0.0) + _MARGIN_PX) * _STEPS_PER_PX)
+    if (seen & (steps < 0)).any():
+        raise ValueError("an observation lies outside of its image")
     return np.where(seen, steps, -1).astype(np.int64)
 
 
@@ -195,6 +201,9 @@ def encode_head(m: MapHead) -> bytes:
                 distance.keyframe_a, distance.keyframe_b, distance.distance_m, distance.sigma_m
             )
         )
+    n_bytes = sum(len(keyframe.image_bytes) for keyframe in m.keyframes)
+    if n_bytes > MAX_BLOB_BYTES:
+        raise ValueError(f"a map with {n_bytes} bytes of images, at most {MAX_BLOB_BYTES}")
     return b"".join(parts + [_encode_keyframe(keyframe) for keyframe in m.keyframes])
 
 
