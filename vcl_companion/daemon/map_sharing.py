@@ -39,6 +39,9 @@ _TAKE_IN_S = 20.0
 _HAND_AGAIN_AT_MOST_S = 120.0
 # A coordinator that we see on the map before ours has made ours: it is about to follow.
 _FOLLOWS_S = 5.0
+# A map that has stayed for so long is likely to stay: it is indexed by all detectors, before
+# somebody is lost in it. In fast flight the next one comes sooner.
+_STAYS_S = 3.0
 # A map that was refused may come again after this: we may know better by then.
 _LOOK_AGAIN_S = 5.0
 
@@ -338,9 +341,14 @@ class MapSharing:
         _log.info("map %s: %d landmarks", stored.revision.hex(), stored.n_landmarks)
         self._tell_state()
         loop = asyncio.get_running_loop()
+        loop.call_later(_STAYS_S, self._want_more_of, stored)
         await loop.run_in_executor(self._executor, self._maps.keep, stored)
         # Making it took a hundred megabytes more than it is.
         await loop.run_in_executor(self._executor, give_back_freed)
+
+    def _want_more_of(self, stored: StoredMap) -> None:
+        if self._maps.is_in_use(stored):
+            self._maps.want_more()
 
     async def _index_more(self) -> None:
         """Index the map in use by the other detectors when that is asked for, once each.
