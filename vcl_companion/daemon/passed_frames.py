@@ -1,8 +1,8 @@
 """The frames of a round at those who did not take them, while the map is still being built.
 
-Images are nearly all of a map's bytes, and known before it is. Passed on by the
+Images are most of an update's bytes, and known before it is. Passed on by the
 coordinator as they come, they are with everybody when the map is made: what has to
-wait for that, poses and landmarks, is a tenth.
+wait for that, poses and landmarks, is a third.
 """
 
 from __future__ import annotations

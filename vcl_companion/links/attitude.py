@@ -106,7 +106,7 @@ class AttitudeHistory:
             return False
         if self._newest_ns(offset_ns) + _CUT_OFF_NS >= at_ns:
             return True
-        return self._carried(at_ns, offset_ns) is not None
+        return self._steps_ahead(at_ns, offset_ns) is not None
 
     def at(self, at_ns: int, offset_ns: int) -> Attitude | None:
         """Return the attitude at an instant.
@@ -128,16 +128,18 @@ class AttitudeHistory:
         if not around or min(abs(at_ns - time) for time in times) > self._max_age_ns:
             return None
         if len(around) == 1:
-            carried = self._carried(at_ns, offset_ns)
-            if carried is not None:
-                return Attitude(carried, at_ns)
-            return Attitude(around[0].ned_from_body, times[0])
-        before, after = (sample.ned_from_body for sample in around)
+            steps = self._steps_ahead(at_ns, offset_ns)
+            if steps is None:
+                return Attitude(around[0].ned_from_body, times[0])
+            return Attitude(_on_arc(self._samples[-2], self._samples[-1], 1.0 + steps), at_ns)
         fraction = (at_ns - times[0]) / (times[1] - times[0])
-        return Attitude(before @ exp_so3(fraction * log_so3(before.T @ after)), at_ns)
+        return Attitude(_on_arc(around[0], around[1], fraction), at_ns)
 
-    def _carried(self, at_ns: int, offset_ns: int) -> Array | None:
-        """Return (3, 3) the attitude shortly after the newest sample, turning on as before."""
+    def _steps_ahead(self, at_ns: int, offset_ns: int) -> float | None:
+        """Return how far an instant lies behind the newest sample, in steps to the one before.
+
+        None where turning on as before does not tell of it.
+        """
         if len(self._samples) < 2:
             return None
         before, last = self._samples[-2], self._samples[-1]
@@ -145,8 +147,7 @@ class AttitudeHistory:
         ahead_ns = at_ns - self._newest_ns(offset_ns)
         if not 0 <= ahead_ns <= min(_CARRIED_NS, _CARRIED_STEPS * step_ns):
             return None
-        turned = log_so3(before.ned_from_body.T @ last.ned_from_body)
-        return np.asarray(last.ned_from_body @ exp_so3(ahead_ns / step_ns * turned))
+        return ahead_ns / step_ns
 
     def _newest_ns(self, offset_ns: int) -> int:
         return self._measured_ns(self._samples[-1]) + offset_ns
@@ -155,3 +156,9 @@ class AttitudeHistory:
     def _measured_ns(sample: AttitudeSample) -> int:
         """Return the likeliest instant of a sample by the autopilot's clock, ns."""
         return sample.time_boot_ms * _NS_PER_MS + _CUT_OFF_NS
+
+
+def _on_arc(before: AttitudeSample, after: AttitudeSample, fraction: float) -> Array:
+    """Return (3, 3) the attitude at a fraction of the turn from one to another, or beyond it."""
+    turn = log_so3(before.ned_from_body.T @ after.ned_from_body)
+    return np.asarray(before.ned_from_body @ exp_so3(fraction * turn))

@@ -68,7 +68,7 @@ _KEYFRAME = struct.Struct("<BQ")
 
 # Then three columns x, y, z of N values in steps of 2^-16 m, then for every keyframe N bits
 # (seen there) and two columns u, v of its seen landmarks in steps of 2^-6 px from pixel -1.
-STEPS_PER_M = 1 << 16
+_STEPS_PER_M = 1 << 16
 _STEPS_PER_PX = 1 << 6
 _MARGIN_PX = 1.0  # a subpixel peak may lie a little outside of the image
 
@@ -98,11 +98,13 @@ class MapHead:
             pixels: (N, V, 2) steps of 2^-6 px, see ``steps_of_pixels``.
 
         Raises:
-            ValueError: they are no landmarks.
+            ValueError: they are no landmarks, or out of range.
         """
+        if np.abs(points).max(initial=0) > MAX_COORDINATE_M * _STEPS_PER_M:
+            raise ValueError("a landmark lies out of range")
         return LandmarkMap(
             keyframes=self.keyframes,
-            points_world=points / STEPS_PER_M,
+            points_world=points / _STEPS_PER_M,
             observed_px=np.where(pixels < 0, np.nan, pixels / _STEPS_PER_PX - _MARGIN_PX),
             pixel_noise_px=self.pixel_noise_px,
             detectors=self.detectors,
@@ -113,7 +115,7 @@ class MapHead:
 
 def steps_of_points(points_world: Array) -> Integers:
     """Return (N, 3) points in steps of 2^-16 m."""
-    return np.rint(points_world * STEPS_PER_M).astype(np.int64)
+    return np.rint(points_world * _STEPS_PER_M).astype(np.int64)
 
 
 def steps_of_pixels(observed_px: Array) -> Integers:
@@ -222,8 +224,6 @@ def decode_map(data: bytes) -> LandmarkMap:
     try:
         head = take_head(reader)
         points = np.stack([take_column(reader, head.n_landmarks) for _ in range(3)], axis=1)
-        if head.n_landmarks and np.abs(points).max() > MAX_COORDINATE_M * STEPS_PER_M:
-            raise WireError("map: a landmark lies out of range")
         pixels = np.full((head.n_landmarks, len(head.keyframes), 2), -1, dtype=np.int64)
         for i, keyframe in enumerate(head.keyframes):
             seen = take_bits(reader, head.n_landmarks)

@@ -38,7 +38,6 @@ from vcl_companion.wire.map_codec import (
     steps_of_points,
     take_pixels,
 )
-from vcl_companion.wire.pose_codec import MAX_COORDINATE_M
 from vcl_companion.wire.reader import Reader
 
 Places = Sequence[int | None]
@@ -122,8 +121,6 @@ def take_landmarks(
     points = np.empty((n, 3), dtype=np.int64)
     points[now] = points_then[then] + _take_points(reader, len(now))
     points[new] = _take_points(reader, len(new))
-    if n and np.abs(points).max() > MAX_COORDINATE_M * (1 << 16):
-        raise WireError("map update: a landmark lies out of range")
     pixels = np.full((n, len(head.keyframes), 2), -1, dtype=np.int64)
     for i, (keyframe, place) in enumerate(zip(head.keyframes, places, strict=True)):
         if place is not None:
