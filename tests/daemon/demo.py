@@ -14,6 +14,8 @@ from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_building import Distances, build_map, update_map
 from vcl_companion.daemon.map_store import StoredMap
+from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.localization.map_index import MapIndex, index_map
@@ -24,6 +26,8 @@ from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.recording import Recording, read_recording
 from vcl_companion.recording.images import load_image
 from vcl_companion.recording.sensor import Sensor
+from vcl_companion.swarm.group import SwarmOptions
+from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.vision.features import FeatureOptions, Features
 from vcl_companion.vision.hamming import hamming_index
 from vcl_companion.wire.frame_codec import FrameAnswer
@@ -94,6 +98,14 @@ def known_distances(*system_ids: int) -> Distances:
     """The distance of the first two of some drones, when the recording begins."""
     a, b = (shot(system_id).ned_from_body.translation for system_id in system_ids[:2])
     return ((system_ids[0], system_ids[1], float(np.linalg.norm(a - b))),)
+
+
+def map_work(swarm: SwarmOptions, sensor: Sensor, inter: InterMavOptions) -> MapWork:
+    """What makes maps for one drone, in threads of this process."""
+    options = WorkOptions(
+        swarm.known_distances, MAP_OPTIONS, FEATURES, ("akaze",), inter, tracked=False
+    )
+    return MapWork(Workshop(sensor, options), forks=False)
 
 
 def answer(system_id: int, k: int = 0, request_id: int = 1) -> FrameAnswer:

@@ -27,6 +27,7 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.worker import Worker
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.mavlink import Tunnel
@@ -72,7 +73,7 @@ class Drone:
         peers: PeerOptions,
         autopilot: tuple[Autopilot, AutopilotLink],
         clock: ManualClock,
-        executor: ThreadPoolExecutor,
+        executor: Worker,
         log_path: Path,
         transfer: TransferOptions,
         inter: InterMavOptions,
@@ -92,13 +93,12 @@ class Drone:
         swarm = SwarmOptions(members, demo.LEADER, demo.known_distances(1, 2))
         rng = np.random.default_rng(seed)
         self.group = Group(swarm, system_id)
+        self.work = demo.map_work(swarm, demo.sensor(system_id), inter)
         self.exchange = Exchange(
             system_id, self.group, Transfers(transfer, rng), self.maps,
-            self.autopilot_link, demo.sensor(system_id), clock, self.log, executor,
-            executor, self.estimator,
-            ExchangeOptions(
-                swarm, demo.MAP_OPTIONS, update, demo.FEATURES, ("akaze",), inter, tracked=False
-            ),
+            self.autopilot_link, demo.sensor(system_id), clock, self.log, self.work,
+            executor, executor, self.estimator,
+            ExchangeOptions(swarm, demo.MAP_OPTIONS, update, ("akaze",), inter, tracked=False),
             rng,
         )  # fmt: skip
         self._link = PeerLink(
@@ -112,6 +112,7 @@ class Drone:
                 parts.create_task(part.run())
 
     def close(self) -> None:
+        self.work.end()
         self.log.close()
 
     def _looked(self) -> None:
@@ -343,7 +344,7 @@ class Swarm:
         self._n_started += 1
         shot = demo.shot(system_id)
         clock = ManualClock(shot.at_ns)
-        executor = life.enter_context(ThreadPoolExecutor(1))
+        executor = life.enter_context(Worker("beside"))
         quaternion = shot.ned_from_body.quaternion()
         autopilot = await life.enter_async_context(
             autopilot_and_link(system_id, clock, shot.at_ns, quaternion)

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from tests.daemon import demo
-from tests.daemon.swarm import swarm
+from tests.daemon.swarm import INTER, swarm
 from tests.daemon.waiting import computed, passes_until, run
 from tests.wire.samples import small_frame
-from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.errors import WireError
 from vcl_companion.swarm.group import Group, SwarmOptions
@@ -37,8 +35,8 @@ class Member:
         self.handed: list[tuple[int, bytes]] = []
         self.cancelled: list[int] = []
         self.frames = PassedFrames(
-            group, self._hand, self.cancelled.append, ThreadPoolExecutor(1),
-            FeatureMemory(demo.FEATURES), "akaze",
+            group, self._hand, self.cancelled.append,
+            demo.map_work(SwarmOptions((1, 2, 3)), demo.sensor(own_id), INTER),
         )  # fmt: skip
 
     def _hand(self, peer: int, blob: bytes) -> int:

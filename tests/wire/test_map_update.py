@@ -32,6 +32,7 @@ from vcl_companion.wire.map_update import (
     decode_map_update,
     encode_map_update,
     images_in_update,
+    images_missing_in,
     name_of_image,
     names_of_update,
     without_images,
@@ -138,6 +139,8 @@ def test_only_what_is_held_stays_at_home() -> None:
     parents = {name_of_image(keyframe.image_bytes) for keyframe in PARENT.keyframes}
     assert without_images(update, parents) == update
     assert images_in_update(without_images(update, {NEW})) == set()
+    assert images_missing_in(update) == set()
+    assert images_missing_in(without_images(update, {NEW})) == {NEW}
 
 
 def test_an_image_that_is_not_here_is_told_of() -> None:

@@ -27,6 +27,7 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.usage import (
     cpu_s,
     give_back_files,
@@ -35,6 +36,7 @@ from vcl_companion.daemon.usage import (
     share_freed,
 )
 from vcl_companion.daemon.worker import Worker
+from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.errors import VclError
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.peers import PeerLink
@@ -49,9 +51,8 @@ _log = logging.getLogger(__name__)
 # A device that does not let go must not keep the flight log from its summary.
 _CLOSE_S = 3.0
 _SWITCH_S = 0.0005
-# Niceness of map making above the frames', and of looking for peers' poses: with half of them
-# each would get half of the machine's time.
-_MAPPING_YIELDS, _HOSTING_YIELDS = 8, 12
+# Niceness of encoding frames for peers above localizing them.
+_ENCODING_YIELDS = 4
 _END_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
@@ -107,9 +108,7 @@ async def _run(config: Config) -> int:
     # The paper's pipeline sends what it has measured, and nothing else.
     motion = config.filter if config.pipeline == "default" else replace(config.filter, coast_s=0.0)
     estimator = Estimator(motion, config.localization, lambda why: log.event("jump", why))
-    # Frames never wait for a map that is being built, nor maps for peers: one thread for each.
-    vision, mapping = Worker("vision"), Worker("mapping", _MAPPING_YIELDS)
-    hosting = Worker("hosting", _HOSTING_YIELDS)
+    vision = Worker("vision")
     # Before anybody is told that we are here: no frame has to wait for the compiler.
     notify.status("compiling, once on this machine")
     warm = loop.run_in_executor(vision, warm_up)
@@ -124,6 +123,25 @@ async def _run(config: Config) -> int:
     gc.freeze()
     give_back_freed()
     give_back_files()
+    tracked = config.pipeline == "default"
+    building = replace(config.map, patches=config.map.patches and tracked)
+    # Frames never wait for a map that is being built: that is another process, begun while
+    # there are no threads at work that it would not have.
+    work = MapWork(
+        Workshop(
+            sensor,
+            WorkOptions(
+                config.swarm.known_distances,
+                building,
+                config.features,
+                config.recognised_by(),
+                config.inter,
+                tracked,
+            ),
+        ),
+        forks=True,
+    )
+    encoding, disk = Worker("encoding", _ENCODING_YIELDS), Worker("disk")
     rng = np.random.default_rng()
     exchange = Exchange(
         config.system_id,
@@ -134,17 +152,17 @@ async def _run(config: Config) -> int:
         sensor,
         clock,
         log,
-        mapping,
-        hosting,
+        work,
+        encoding,
+        disk,
         estimator,
         ExchangeOptions(
             config.swarm,
-            replace(config.map, patches=config.map.patches and config.pipeline == "default"),
+            building,
             config.update,
-            config.features,
             config.recognised_by(),
             config.inter,
-            tracked=config.pipeline == "default",
+            tracked,
         ),
         rng,
     )
@@ -190,17 +208,19 @@ async def _run(config: Config) -> int:
                     await camera.close()
         finally:
             # What still runs is not waited for: an update takes seconds, and nobody wants it.
-            vision.shutdown(wait=False, cancel_futures=True)
-            mapping.shutdown(wait=False, cancel_futures=True)
-            hosting.shutdown(wait=False, cancel_futures=True)
+            for worker in (vision, encoding, disk):
+                worker.shutdown(wait=False, cancel_futures=True)
+            taken = work.end()
             log.close(
-                cpu_s=cpu_s() - began_cpu_s,
+                cpu_s=cpu_s() - began_cpu_s + taken.cpu_s,
                 wall_s=time.monotonic() - began_at_s,
-                resident_mb=peak_resident_mb(),
+                resident_mb=peak_resident_mb() + taken.peak_mb,
                 peer_bytes_sent=peers.counters.bytes_out,
                 peer_bytes_received=peers.counters.bytes_in,
             )
-    vision.exit_status = mapping.exit_status = hosting.exit_status = 0
+    for worker in (vision, encoding, disk):
+        worker.exit_status = 0
+    work.ends_with(0)
     return 0
 
 

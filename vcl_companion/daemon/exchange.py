@@ -20,7 +20,6 @@ import numpy as np
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
 from vcl_companion.daemon.estimator import Estimator
-from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_answers import FrameAnswers
 from vcl_companion.daemon.frame_history import FrameHistory
@@ -29,6 +28,7 @@ from vcl_companion.daemon.inter_target import InterTarget
 from vcl_companion.daemon.map_rounds import MapRounds, RoundOptions
 from vcl_companion.daemon.map_sharing import MapSharing
 from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.daemon.refusals import Refusals
 from vcl_companion.errors import WireError
@@ -49,7 +49,7 @@ from vcl_companion.swarm.transfer import (
     Transfers,
 )
 from vcl_companion.swarm.updates import OwnVote, Sight, UpdateOptions
-from vcl_companion.vision.features import Detector, FeatureOptions
+from vcl_companion.vision.features import Detector
 from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.frame_codec import decode_frame
 from vcl_companion.wire.messages import MAX_TRACKED, FrameRequest, MapRefused, MapState
@@ -69,7 +69,6 @@ class ExchangeOptions:
     swarm: SwarmOptions
     map: MapOptions
     update: UpdateOptions
-    features: FeatureOptions
     detectors: tuple[Detector, ...]
     inter: InterMavOptions
     tracked: bool
@@ -87,8 +86,9 @@ class Exchange:
         sensor: of our camera.
         clock: time base of frames.
         log: told of maps and peers.
-        executor: runs map building and indexing.
-        hosting: runs the search for peers' poses, so that no map waits for it.
+        work: makes maps, and looks for peers' poses.
+        encoding: encodes our frames for peers.
+        disk: writes maps.
         estimator: where this drone is, and whether it knows.
         options: of the steps.
         rng: numbers our requests.
@@ -104,8 +104,9 @@ class Exchange:
         sensor: Sensor,
         clock: Clock,
         log: FlightLog,
-        executor: Executor,
-        hosting: Executor,
+        work: MapWork,
+        encoding: Executor,
+        disk: Executor,
         estimator: Estimator,
         options: ExchangeOptions,
         rng: np.random.Generator,
@@ -116,20 +117,16 @@ class Exchange:
         self._maps = maps
         self._clock = clock
         self._log = log
-        self._executor = executor
         self._estimator = estimator
         self._options = options
         self._link: PeerLink | None = None
         self._refusals = Refusals(log)
         self._frames = FrameHistory()
-        memory = FeatureMemory(options.features)
         self._passed = PassedFrames(
             group,
             partial(self._hand, BlobKind.PASSED_FRAME),
             transfers.cancel,
-            executor,
-            memory,
-            options.detectors[0],
+            work,
         )
         self._answers = FrameAnswers(
             system_id,
@@ -139,7 +136,7 @@ class Exchange:
             sensor,
             clock,
             log,
-            executor,
+            encoding,
             partial(self._hand, BlobKind.FRAME_ANSWER),
             transfers.cancel,
             self._passed.given,
@@ -156,8 +153,8 @@ class Exchange:
             lambda: transfers.is_receiving(BlobKind.MAP, self._now_s()),
             log,
             clock,
-            executor,
-            RoundOptions(options.swarm.known_distances, options.map, options.update, memory),
+            work,
+            RoundOptions(options.map, options.update),
             rng,
         )
         self._sharing = MapSharing(
@@ -165,23 +162,20 @@ class Exchange:
             transfers,
             maps,
             log,
-            executor,
-            hosting,
+            work,
+            disk,
             self._tell_state,
             self._refusals.count,
-            options.detectors,
-            options.features,
-            memory,
             self._passed,
             options.update.delivery_wait_s,
-            options.tracked,
+            len(options.detectors) > 1,
         )
         self.inter = InterTarget(
             system_id,
             HostChoice(group),
             sensor,
             clock,
-            executor,
+            encoding,
             partial(self._hand, BlobKind.POSE_REQUEST),
             transfers.cancel,
             options.inter,
@@ -194,11 +188,9 @@ class Exchange:
             estimator,
             self._send,
             self._refusals.count,
-            sensor,
             clock,
-            hosting,
-            options.features,
-            options.inter,
+            work,
+            options.inter.detector,
             options.detectors,
             tries_all=options.tracked,
         )

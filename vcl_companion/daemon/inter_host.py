@@ -8,12 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
+from collections.abc import Callable
 from contextlib import suppress
-
-import numpy as np
 
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
@@ -21,17 +17,12 @@ from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.mailbox import PeerMailbox
 from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.errors import WireError
-from vcl_companion.geometry.rotation import matrix_from_quaternion
-from vcl_companion.localization.inter import NoProposal, Proposal, localize_inter
-from vcl_companion.localization.map_index import MapIndex, index_map
-from vcl_companion.localization.pair_evidence import Observer
+from vcl_companion.localization.inter import NoProposal, Proposal
+from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pose_filter import FilterState
-from vcl_companion.mapping.drone_view import decode_image
-from vcl_companion.recording.sensor import Sensor
-from vcl_companion.swarm.pose_requests import InterMavOptions
-from vcl_companion.vision.features import Detector, FeatureOptions, Features, Image, detect
-from vcl_companion.wire.frame_codec import FrameAnswer
+from vcl_companion.vision.features import Detector
 from vcl_companion.wire.pose_messages import (
     PoseProposal,
     PoseRefused,
@@ -41,8 +32,6 @@ from vcl_companion.wire.pose_messages import (
 
 _log = logging.getLogger(__name__)
 
-# Several targets ask about the same moment: our own features of it are found once.
-_N_KEPT = 6
 # Our own frame of that moment may be being looked at right now.
 _SETTLE_S = 0.5
 # The map may have to be indexed by our detector first, behind an update that is being built.
@@ -58,14 +47,12 @@ class InterHost:
         estimator: what we believed when these were taken.
         answer: sends a message to a peer.
         refuse: counts what a peer sent in vain: peer, kind, detail.
-        sensor: of our camera.
         clock: time base of frames.
-        executor: runs the vision, beside our own frames'.
-        features: how they are found.
-        options: thresholds.
+        work: does the vision, beside our own frames'.
+        detector: the paper's way finds peers by it.
         indexed_by: detectors that the daemon indexes its maps by, some only when asked to.
         tries_all: whether every index that there is is tried before the request is refused;
-            else only that by ``options.detector``, which is waited for: the paper's way.
+            else only that by ``detector``, which is waited for: the paper's way.
     """
 
     def __init__(
@@ -75,11 +62,9 @@ class InterHost:
         estimator: Estimator,
         answer: Callable[[PoseProposal | PoseRefused, int], None],
         refuse: Callable[[int, str, str], None],
-        sensor: Sensor,
         clock: Clock,
-        executor: Executor,
-        features: FeatureOptions,
-        options: InterMavOptions,
+        work: MapWork,
+        detector: Detector,
         indexed_by: tuple[Detector, ...],
         *,
         tries_all: bool,
@@ -90,10 +75,9 @@ class InterHost:
         self._answer = answer
         self._refuse = refuse
         self._clock = clock
-        self._executor = executor
-        self._look = _Look(sensor, features, options, indexed_by, tries_all)
-        self._detector = options.detector
-        self._is_made = options.detector in indexed_by
+        self._work = work
+        self._detector: Detector = detector
+        self._is_made = detector in indexed_by
         self._tries_all = tries_all
         self._requests: PeerMailbox[tuple[int, bytes]] = PeerMailbox()
 
@@ -134,11 +118,8 @@ class InterHost:
         if own is None:
             return NoProposal("the host does not know where it was then")
         stored = await self._indexed(stored)
-        loop = asyncio.get_running_loop()
         try:
-            said = await loop.run_in_executor(
-                self._executor, self._look.from_frame, *own, stored, request.frame
-            )
+            said = await self._work.place_of_peer(*own, stored, request.frame)
         except ValueError as error:
             return NoProposal(str(error))
         except Exception as error:
@@ -179,96 +160,3 @@ def _index_by(detector: Detector, stored: StoredMap) -> MapIndex | None:
     while known is not None and known.detector != detector:
         known = known.fallback
     return known
-
-
-class _Look:
-    """The vision of it; used by the executor's one thread only."""
-
-    def __init__(
-        self,
-        sensor: Sensor,
-        features: FeatureOptions,
-        options: InterMavOptions,
-        indexed_by: tuple[Detector, ...],
-        tries_all: bool,
-    ) -> None:
-        self._sensor = sensor
-        self._features = features
-        self._options = options
-        self._is_made = options.detector in indexed_by
-        self._tries_all = tries_all
-        self._index: tuple[bytes, MapIndex] | None = None
-        self._own: deque[tuple[int, Detector, Features]] = deque(maxlen=_N_KEPT)
-
-    def from_frame(
-        self, frame: Frame, state: FilterState, stored: StoredMap, seen: FrameAnswer
-    ) -> Proposal | NoProposal:
-        """Propose where the drone that saw a frame was.
-
-        Args:
-            frame: our own.
-            state: what we believe of its instant.
-            stored: the map of both.
-            seen: the target's frame.
-
-        Raises:
-            ValueError: the target's image cannot be decoded, or the map holds
-                nothing that our detector finds.
-        """
-        image = decode_image(seen.image_bytes, seen.camera)
-        said: Proposal | NoProposal = NoProposal("the map is not indexed for peers yet")
-        for index in self._indexes(stored):
-            said = self._by_index(frame, state, index, seen, image)
-            if isinstance(said, Proposal):
-                break
-        return said
-
-    def _by_index(
-        self,
-        frame: Frame,
-        state: FilterState,
-        index: MapIndex,
-        seen: FrameAnswer,
-        image: Image,
-    ) -> Proposal | NoProposal:
-        """Propose it by one detector."""
-        host = Observer(
-            self._own_features(frame, index.detector),
-            self._sensor.camera,
-            self._sensor.body_from_cam,
-            state.ned_from_body,
-        )
-        attitude = seen.ned_from_body
-        target = Observer(
-            detect(image, index.detector, self._features),
-            seen.camera,
-            seen.body_from_cam,
-            None if attitude is None else matrix_from_quaternion(attitude),
-        )
-        pose, covariance = state.world_from_body, state.pose_covariance()
-        return localize_inter(host, pose, covariance, target, index, self._options)
-
-    def _own_features(self, frame: Frame, detector: Detector) -> Features:
-        for sequence, by, features in self._own:
-            if (sequence, by) == (frame.sequence, detector):
-                return features
-        found = detect(np.asarray(frame.image), detector, self._features)
-        self._own.append((frame.sequence, detector, found))
-        return found
-
-    def _indexes(self, stored: StoredMap) -> Iterator[MapIndex]:
-        """Yield the indexes to try, the cheapest first."""
-        known: MapIndex | None = stored.index
-        while known is not None:
-            if self._tries_all or known.detector == self._options.detector:
-                yield known
-            known = known.fallback
-        if not self._is_made:
-            yield self._own_index(stored)
-
-    def _own_index(self, stored: StoredMap) -> MapIndex:
-        """Return the index by a detector that nobody else in this daemon uses."""
-        if self._index is None or self._index[0] != stored.revision:
-            index = index_map(stored.index.landmark_map, self._options.detector, self._features)
-            self._index = (stored.revision, index)
-        return self._index[1]

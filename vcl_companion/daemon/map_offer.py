@@ -48,6 +48,16 @@ class MapOffer:
 
 
 @dataclass(frozen=True, eq=False)
+class HandOut:
+    """A map to be handed out; the fields are those of ``StoredMap``."""
+
+    revision: bytes
+    parent: bytes
+    data: bytes
+    update: bytes
+
+
+@dataclass(frozen=True, eq=False)
 class ReadyMap:
     """A map that can be flown on; the fields are those of ``StoredMap``."""
 
@@ -55,6 +65,10 @@ class ReadyMap:
     index: MapIndex
     update: bytes
     templates: Templates | None
+
+    def stored(self) -> StoredMap:
+        """Return it as it is held while it is in use."""
+        return StoredMap(revision_of(self.data), self.data, self.index, self.update, self.templates)
 
 
 def ready_map(

@@ -11,19 +11,17 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable
-from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
 
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
-from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.gathering import Gathering, Wanted
-from vcl_companion.daemon.map_building import Distances, build_map, update_map
 from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
@@ -50,16 +48,12 @@ class RoundOptions:
     """What rounds are tuned by.
 
     Attributes:
-        known_distances: (drone, drone, metres).
         map: thresholds of the building.
         update: when and how maps are updated.
-        memory: finds features; only the executor's thread uses it.
     """
 
-    known_distances: Distances
     map: MapOptions
     update: UpdateOptions
-    memory: FeatureMemory
 
 
 class MapRounds:
@@ -76,7 +70,7 @@ class MapRounds:
         is_receiving_map: whether a peer's map has been coming in lately.
         log: told of every update that is begun.
         clock: time base of frames.
-        executor: runs the building.
+        work: does the building.
         options: of the steps.
         rng: numbers the requests.
     """
@@ -93,7 +87,7 @@ class MapRounds:
         is_receiving_map: Callable[[], bool],
         log: FlightLog,
         clock: Clock,
-        executor: Executor,
+        work: MapWork,
         options: RoundOptions,
         rng: np.random.Generator,
     ) -> None:
@@ -107,7 +101,7 @@ class MapRounds:
         self._is_receiving_map = is_receiving_map
         self._log = log
         self._clock = clock
-        self._executor = executor
+        self._work = work
         self._options = options
         self._gathering = Gathering(group, ask, clock, rng)
         self._trigger = UpdateTrigger(options.update, group)
@@ -168,16 +162,11 @@ class MapRounds:
         return waited < (_MAX_DELIVERIES if self._is_receiving_map() else 1.0)
 
     async def _first_map(self, frame: Frame) -> None:
-        options, leader = self._options, self._group.leader
-
-        def build(frames: list[FrameAnswer]) -> LandmarkMap | NoMap:
-            distances = options.known_distances
-            return build_map(frames, leader, distances, options.map, options.memory)
-
+        leader = self._group.leader
         request_id = self._gathering.begin()
-        wanted = Wanted(frame.captured_at_ns, timeout_s=options.map.gather_timeout_s)
+        wanted = Wanted(frame.captured_at_ns, timeout_s=self._options.map.gather_timeout_s)
         frames = await self._gathered(frame, wanted, self._has_map)
-        built = await self._built(frames, build)
+        built = await self._built(frames, lambda frames: self._work.first_map(frames, leader))
         if not self._has_map():
             await self._decide(built, None, request_id)
 
@@ -252,10 +241,8 @@ class MapRounds:
     async def _updated(
         self, stored: StoredMap, frames: list[FrameAnswer] | NoMap, *, at_once: bool
     ) -> LandmarkMap | NoMap:
-        options = self._options
-
-        def build(frames: list[FrameAnswer]) -> LandmarkMap | NoMap:
-            return update_map(stored, frames, options.map, options.memory, at_once=at_once)
+        def build(frames: list[FrameAnswer]) -> Awaitable[LandmarkMap | NoMap]:
+            return self._work.next_revision(stored, frames, at_once=at_once)
 
         return await self._built(frames, build)
 
@@ -287,14 +274,13 @@ class MapRounds:
     async def _built(
         self,
         frames: list[FrameAnswer] | NoMap,
-        build: Callable[[list[FrameAnswer]], LandmarkMap | NoMap],
+        build: Callable[[list[FrameAnswer]], Awaitable[LandmarkMap | NoMap]],
     ) -> LandmarkMap | NoMap:
         if isinstance(frames, NoMap):
             return frames
-        loop = asyncio.get_running_loop()
         began_s = self._now_s()
         try:
-            built = await loop.run_in_executor(self._executor, build, frames)
+            built = await build(frames)
             _log.info("%d frames built into a map in %.1f s", len(frames), self._now_s() - began_s)
             return built
         except Exception as error:

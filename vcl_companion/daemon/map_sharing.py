@@ -13,11 +13,11 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
-from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.mailbox import PeerMailbox
-from vcl_companion.daemon.map_offer import MapOffer, ReadyMap, ready_map, with_fallbacks
+from vcl_companion.daemon.map_offer import HandOut, MapOffer, ReadyMap
 from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.daemon.usage import give_back_freed
 from vcl_companion.errors import WireError
@@ -25,9 +25,7 @@ from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import NoMap
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.transfer import BlobKind, Transfers
-from vcl_companion.vision.features import Detector, FeatureOptions
-from vcl_companion.wire.map_codec import encode_map, revision_of
-from vcl_companion.wire.map_update import encode_map_update, images_in_update, without_images
+from vcl_companion.wire.map_update import images_in_update, images_missing_in, without_images
 
 _log = logging.getLogger(__name__)
 
@@ -56,16 +54,6 @@ class _Handed:
     again_at_s: float
 
 
-@dataclass(frozen=True, eq=False)
-class _HandOut:
-    """A map to be handed out; the fields are those of ``StoredMap``."""
-
-    revision: bytes
-    parent: bytes
-    data: bytes
-    update: bytes
-
-
 @dataclass(frozen=True)
 class _Update:
     """An update with all its images: whose, their names, and the forms for those who hold some."""
@@ -83,17 +71,14 @@ class MapSharing:
         transfers: blobs on their way.
         maps: the current map.
         log: told of every map flown on.
-        executor: runs decoding, indexing and writing.
-        hosting: runs indexing by the other detectors, so that no map waits for it.
+        work: does decoding and indexing.
+        disk: runs the writing.
         tell_state: tells peers which map we fly on.
         refuse: counts what a peer sent in vain: peer, kind, detail.
-        detectors: the localization's own, and what it falls back on.
-        features: how they are found.
-        memory: finds them; only the executor's thread uses it.
         passed: who was sent which image ahead.
         delivery_wait_s: how long a coordinator that is back with a map which we
             have left may take to be brought up to date; then it has its way.
-        tracked: whether maps are made ready to be tracked by their patches.
+        falls_back: whether maps are indexed by other detectors too, sooner or later.
     """
 
     def __init__(
@@ -102,35 +87,29 @@ class MapSharing:
         transfers: Transfers,
         maps: MapStore,
         log: FlightLog,
-        executor: Executor,
-        hosting: Executor,
+        work: MapWork,
+        disk: Executor,
         tell_state: Callable[[], None],
         refuse: Callable[[int, str, str], None],
-        detectors: tuple[Detector, ...],
-        features: FeatureOptions,
-        memory: FeatureMemory,
         passed: PassedFrames,
         delivery_wait_s: float,
-        tracked: bool,
+        falls_back: bool,
     ) -> None:
         self._group = group
         self._transfers = transfers
         self._maps = maps
         self._log = log
-        self._executor = executor
-        self._hosting = hosting
+        self._work = work
+        self._disk = disk
         self._tell_state = tell_state
         self._refuse = refuse
-        self._detectors = detectors
-        self._features = features
-        self._memory = memory
         self._passed = passed
         self._delivery_wait_s = delivery_wait_s
-        self._tracked = tracked
+        self._falls_back = falls_back
         self._offered: PeerMailbox[MapOffer] = PeerMailbox()
         self._handed: dict[int, _Handed] = {}
         self._update: _Update | None = None
-        self._ahead: _HandOut | None = None  # ours is not ready yet, peers may have it
+        self._ahead: HandOut | None = None  # ours is not ready yet, peers may have it
         self._behind_since_s: float | None = None  # the coordinator, as far as known
 
     def offer(self, peer: int, kind: BlobKind, blob: bytes) -> None:
@@ -192,9 +171,8 @@ class MapSharing:
         Returns:
             None, or why it cannot be used. A map that came meanwhile stays.
         """
-        loop = asyncio.get_running_loop()
         try:
-            self._ahead = await loop.run_in_executor(self._executor, _encoded, built, instead_of)
+            self._ahead = await self._work.encoded(built, instead_of)
         except (WireError, ValueError) as error:
             return NoMap(str(error))
         except Exception as error:
@@ -243,7 +221,7 @@ class MapSharing:
             )
 
     def _form_for(
-        self, peer: int, stored: _HandOut, n_delivered: int
+        self, peer: int, stored: HandOut, n_delivered: int
     ) -> tuple[BlobKind, bytes] | None:
         """Return what to send: without the images that a peer has, unless that was in vain.
 
@@ -312,19 +290,11 @@ class MapSharing:
 
     async def _prepared(self, offer: MapOffer) -> ReadyMap | NoMap:
         """Make a map ready for use, beside the event loop; or say why it cannot be used."""
-        loop = asyncio.get_running_loop()
         try:
-            return await loop.run_in_executor(
-                self._executor,
-                ready_map,
-                offer,
-                self._maps.current,
-                self._detectors[0],
-                self._features,
-                self._memory,
-                self._tracked,
-                self._passed.held,
-            )
+            is_update = offer.kind == BlobKind.MAP_UPDATE
+            missing = images_missing_in(offer.blob) if is_update else frozenset[bytes]()
+            held = {name: image for name, image in self._passed.held.items() if name in missing}
+            return await self._work.ready(offer, self._maps.current, held)
         except (WireError, ValueError) as error:
             return NoMap(str(error))
         except Exception as error:
@@ -342,9 +312,8 @@ class MapSharing:
         self._tell_state()
         loop = asyncio.get_running_loop()
         loop.call_later(_STAYS_S, self._want_more_of, stored)
-        await loop.run_in_executor(self._executor, self._maps.keep, stored)
-        # Making it took a hundred megabytes more than it is.
-        await loop.run_in_executor(self._executor, give_back_freed)
+        await loop.run_in_executor(self._disk, self._maps.keep, stored)
+        await loop.run_in_executor(self._disk, give_back_freed)
 
     def _want_more_of(self, stored: StoredMap) -> None:
         if self._maps.is_in_use(stored):
@@ -355,37 +324,15 @@ class MapSharing:
 
         It takes as long as the map itself, and most revisions are never asked about.
         """
-        loop = asyncio.get_running_loop()
-        memory = FeatureMemory(self._features)  # one thread's, like the other one
         done: StoredMap | None = None
         while True:
             stored = await self._maps.more_wanted()
-            if stored is done or not self._detectors[1:]:
+            if stored is done or not self._falls_back:
                 continue
-            index = await loop.run_in_executor(
-                self._hosting,
-                with_fallbacks,
-                stored.index,
-                self._detectors[1:],
-                self._features,
-                memory,
-            )
-            self._maps.improve(stored, index)
+            self._maps.improve(stored, await self._work.more_indexed(stored))
             if self._maps.is_in_use(stored):
                 done = self._maps.current
-            await loop.run_in_executor(self._hosting, give_back_freed)
 
 
-def _hand_out_of(stored: StoredMap) -> _HandOut:
-    return _HandOut(stored.revision, stored.parent, stored.data, stored.update)
-
-
-def _encoded(built: LandmarkMap, parent: StoredMap | None) -> _HandOut:
-    """Return a map of our own as peers get it.
-
-    Raises:
-        ValueError: the map breaks a bound that peers hold every map to.
-    """
-    data = encode_map(built)
-    update = encode_map_update(data, parent.index.landmark_map) if parent is not None else b""
-    return _HandOut(revision_of(data), built.parent, data, update)
+def _hand_out_of(stored: StoredMap) -> HandOut:
+    return HandOut(stored.revision, stored.parent, stored.data, stored.update)

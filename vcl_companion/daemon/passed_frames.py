@@ -11,13 +11,11 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable, Mapping
-from concurrent.futures import Executor
 from dataclasses import dataclass, field
 
-from vcl_companion.daemon.feature_memory import FeatureMemory
+from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.errors import WireError
 from vcl_companion.swarm.group import Group
-from vcl_companion.vision.features import Detector
 from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame, encode_frame
 from vcl_companion.wire.header import BlobKind
 from vcl_companion.wire.map_update import name_of_image
@@ -43,9 +41,7 @@ class PassedFrames:
         group: who is there.
         hand: sends a frame to a peer; returns the transfer's id.
         cancel: ends a transfer, one that is over already too.
-        executor: runs the detector on what has come.
-        memory: finds features; only the executor's thread uses it.
-        detector: the localization's own: a map with this image will be indexed by it.
+        work: finds the features of what has come: a map with this image will need them.
     """
 
     def __init__(
@@ -53,16 +49,12 @@ class PassedFrames:
         group: Group,
         hand: Callable[[int, bytes], int],
         cancel: Callable[[int], None],
-        executor: Executor,
-        memory: FeatureMemory,
-        detector: Detector,
+        work: MapWork,
     ) -> None:
         self._group = group
         self._hand = hand
         self._cancel = cancel
-        self._executor = executor
-        self._memory = memory
-        self._detector: Detector = detector
+        self._work = work
         self._peers: dict[int, _AtPeer] = {}
         self._held: dict[bytes, bytes] = {}
         self._new: asyncio.Queue[FrameAnswer] = asyncio.Queue(_N_HELD)
@@ -98,17 +90,10 @@ class PassedFrames:
 
     async def run(self) -> None:
         """Find the features of what goes round, before the map needs them, until cancelled."""
-        loop = asyncio.get_running_loop()
         while True:
             frame = await self._new.get()
             try:
-                await loop.run_in_executor(
-                    self._executor,
-                    self._memory.features,
-                    frame.image_bytes,
-                    frame.camera,
-                    self._detector,
-                )
+                await self._work.look_at(frame)
             except ValueError as error:
                 _log.debug("a frame of drone %d: %s", frame.drone_id, error)
             except Exception:

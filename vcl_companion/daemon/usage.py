@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import resource
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
-_STATUS = Path("/proc/self/status")
-_MAPS = Path("/proc/self/smaps")
+_PROC = Path("/proc")
+_MAPS = _PROC / "self/smaps"
 _MADV_DONTNEED = 4  # <linux/mman.h>, the same on all architectures but alpha
 _WORTH_KB = 256
 _ARENA_MAX = -8  # <malloc.h>
 # Changed pages, those of relocated tables say, would come back as the file has them.
 _CHANGED = ("Private_Dirty:", "Shared_Dirty:", "Anonymous:")
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What a process has taken of the machine: processor time, and memory of its own at most."""
+
+    cpu_s: float = 0.0
+    peak_mb: float = 0.0
 
 
 def cpu_s() -> float:
@@ -29,11 +39,32 @@ def peak_resident_mb() -> float:
     Not ``ru_maxrss``, where the kernel tells: that one survives exec, so that a
     small process started by a large one claims the large one's.
     """
-    with suppress(OSError, ValueError):
-        for line in _STATUS.read_text(encoding="ascii").splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 1024
+    with suppress(OSError, ValueError, KeyError):
+        return _kilobytes("self/status")["VmHWM:"] / 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def usage_of(forked_pid: int) -> Usage:
+    """Return what a process forked off this one has taken, without what it shares with us now.
+
+    Zeros where the kernel does not tell, or there is no such process.
+    """
+    with suppress(OSError, ValueError, KeyError, IndexError):
+        # The name may hold blanks and brackets: what follows its last bracket counts.
+        told = (_PROC / f"{forked_pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+        ticks = int(told[11]) + int(told[12])
+        peak = _kilobytes(f"{forked_pid}/status")["VmHWM:"]
+        pages = _kilobytes(f"{forked_pid}/smaps_rollup")
+        shared = pages["Shared_Clean:"] + pages["Shared_Dirty:"]
+        return Usage(ticks / os.sysconf("SC_CLK_TCK"), (peak - shared) / 1024)
+    return Usage()
+
+
+def _kilobytes(file: str) -> dict[str, int]:
+    """Read the lines "Key: value kB" of a file of the kernel's."""
+    lines = (_PROC / file).read_text(encoding="utf-8").splitlines()
+    fields = [line.split() for line in lines]
+    return {f[0]: int(f[1]) for f in fields if len(f) == 3 and f[2] == "kB"}
 
 
 def share_freed() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,17 @@ class MapIndex:
     detector: Detector
     search: HammingIndex | None = None
     fallback: MapIndex | None = None
+
+    def of_the_same_map(self, other: MapIndex) -> MapIndex:
+        """Return this index, and what it falls back on, with another one's copy of the map."""
+        fallback = self.fallback
+        return replace(
+            self,
+            landmark_map=other.landmark_map,
+            uncertainty=other.uncertainty,
+            landmark_covariances=other.landmark_covariances,
+            fallback=None if fallback is None else fallback.of_the_same_map(other),
+        )
 
 
 def index_map(

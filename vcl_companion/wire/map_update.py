@@ -77,6 +77,17 @@ def images_in_update(update: bytes) -> frozenset[bytes]:
     return frozenset(name_of_image(k.image_bytes) for k in keyframes if not _is_reference(k))
 
 
+def images_missing_in(update: bytes) -> frozenset[bytes]:
+    """Return the names of the images that an encoded update takes its receiver to hold.
+
+    Raises:
+        WireError: the bytes are no update.
+    """
+    _, reader = _split(update)
+    images = (keyframe.image_bytes for keyframe in _head_of(reader).keyframes)
+    return frozenset(image for image in images if len(image) == _NAME_BYTES)
+
+
 def without_images(update: bytes, held: Collection[bytes]) -> bytes:
     """Return an encoded update for one who holds images by these names as well.
 

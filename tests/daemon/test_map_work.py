@@ -1,0 +1,127 @@
+"""The workshop in a process of its own, in threads, and when that process is lost."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from tests.daemon import demo
+from tests.daemon.waiting import run
+from vcl_companion.daemon.map_offer import MapOffer
+from vcl_companion.daemon.map_store import StoredMap
+from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.workshop import WorkOptions, Workshop
+from vcl_companion.errors import WireError
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.swarm.pose_requests import InterMavOptions
+from vcl_companion.wire.header import BlobKind
+from vcl_companion.wire.map_codec import encode_map, revision_of
+
+PAIR = demo.encoded_map(1, 2)
+
+
+class Workplace(Workshop):
+    """Knows where it is."""
+
+    def learn(self, stored: StoredMap) -> None:
+        if stored.data == b"where?":
+            raise ValueError(os.getpid())
+        super().learn(stored)
+
+
+def workplace() -> Workplace:
+    options = WorkOptions(
+        demo.known_distances(1, 2), demo.MAP_OPTIONS, demo.FEATURES, ("akaze", "orb"),
+        InterMavOptions(detector="akaze"), tracked=True,
+    )  # fmt: skip
+    return Workplace(demo.sensor(1), options)
+
+
+@pytest.fixture(params=[True, False], ids=["process", "threads"])
+def work(request: pytest.FixtureRequest) -> Iterator[MapWork]:
+    made = MapWork(workplace(), forks=request.param)
+    yield made
+    made.end()
+
+
+def pair() -> StoredMap:
+    return StoredMap(revision_of(PAIR), PAIR, demo.map_index(1, 2))
+
+
+def test_a_first_map_is_made_and_made_ready(work: MapWork) -> None:
+    async def check() -> None:
+        frames = [demo.answer(1), demo.answer(2)]
+        await work.look_at(frames[0])
+        built = await work.first_map(frames, demo.LEADER)
+        assert isinstance(built, LandmarkMap)
+        handed = await work.encoded(built, None)
+        assert (handed.data, handed.update) == (encode_map(built), b"")
+        ready = await work.ready(MapOffer.of(BlobKind.MAP, handed.data), None, {})
+        assert ready.stored().revision == handed.revision
+        assert ready.templates is not None
+        assert len(ready.templates.anchors.pixels) > 100
+
+    run(check())
+
+
+def test_a_map_that_it_has_not_seen_is_handed_over_and_extended(work: MapWork) -> None:
+    async def check() -> None:
+        frames = [demo.answer(system_id, 12) for system_id in (1, 2, 3)]
+        built = await work.next_revision(pair(), frames, at_once=False)
+        assert isinstance(built, LandmarkMap)
+        assert built.parent == revision_of(PAIR)
+        handed = await work.encoded(built, pair())
+        assert 0 < len(handed.update) < len(handed.data)
+
+    run(check())
+
+
+def test_further_indexes_share_the_map_that_is_in_use(work: MapWork) -> None:
+    async def check() -> None:
+        stored = pair()
+        index = await work.more_indexed(stored)
+        assert index.detector == "akaze"
+        assert index.fallback is not None
+        assert index.fallback.detector == "orb"
+        for one in (index, index.fallback):
+            assert one.landmark_map is stored.index.landmark_map
+            assert one.uncertainty is stored.index.uncertainty
+        np.testing.assert_array_equal(index.owner, stored.index.owner)
+
+    run(check())
+
+
+def test_bad_bytes_are_told_as_such(work: MapWork) -> None:
+    async def check() -> None:
+        broken = PAIR[:-7]
+        with pytest.raises(WireError):
+            await work.ready(MapOffer(BlobKind.MAP, broken, b"x" * 8, b""), None, {})
+        assert await work.ready(MapOffer.of(BlobKind.MAP, PAIR), None, {})
+
+    run(check())
+
+
+def test_a_lost_process_is_replaced_by_threads() -> None:
+    async def where(work: MapWork) -> int:
+        with pytest.raises(ValueError, match=r"^[0-9]+") as told:
+            await work._do("maps", "learn", StoredMap(b"", b"where?", demo.map_index(1, 2)))
+        return int(str(told.value))
+
+    async def check() -> None:
+        work = MapWork(workplace(), forks=True)
+        pid = await where(work)
+        assert pid != os.getpid()
+        await work.ready(MapOffer.of(BlobKind.MAP, PAIR), None, {})
+        os.kill(pid, signal.SIGKILL)
+        # It knew this map, its successor does not.
+        frames = [demo.answer(system_id, 12) for system_id in (1, 2, 3)]
+        built = await work.next_revision(pair(), frames, at_once=False)
+        assert isinstance(built, LandmarkMap)
+        assert await where(work) == os.getpid()
+        assert work.end().cpu_s >= 0.0
+
+    run(check())

@@ -1,0 +1,242 @@
+"""A process of its own for the methods of an object, forked off this one.
+
+A thread beside the frames' would not do: each holds the interpreter's lock for as long
+as one call into a library takes, and a nice one holds it while it waits for a processor.
+Forked rather than started anew, it shares what this process has loaded and compiled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import pickle
+import signal
+import socket
+import struct
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Mapping
+from concurrent.futures import Future
+from typing import Any
+
+from vcl_companion.daemon.usage import Usage, usage_of
+from vcl_companion.daemon.worker import Worker
+
+_HEAD = struct.Struct("<QQ")
+_SIZE = struct.Struct("<Q")
+_PROTOCOL = 5  # large arrays beside the stream, not in it
+_END_S = 2.0
+_LOOK_S = 0.01
+
+
+class ProcessLostError(Exception):
+    """The process has ended before it was told to, and what it was asked for is not done."""
+
+
+class Forked:
+    """Calls methods of an object in a process of its own.
+
+    Make it when no other thread is at work: the child has this one only. The child ends
+    with this process, however that ends; interrupts from the terminal it leaves to it.
+
+    Args:
+        target: whose methods are called; the child's copy and this one know nothing of
+            each other.
+        lanes: niceness above ours of each thread of the child's, by name. A thread does one
+            call after the other.
+    """
+
+    def __init__(self, target: object, lanes: Mapping[str, int]) -> None:
+        self._socket, other = socket.socketpair()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        self._pid = os.fork()
+        if self._pid == 0:
+            self._socket.close()
+            _serve(other, target, lanes)
+        other.close()
+        self._calls: dict[int, Future[Any]] = {}
+        self._ids = itertools.count()
+        self._lock = threading.Lock()
+        self._is_lost = False
+        # Never the event loop's thread: the child may be slow to read.
+        self._writer = Worker("to-forked")
+        self._reader = threading.Thread(target=self._read, name="from-forked", daemon=True)
+        self._reader.start()
+
+    def call(self, lane: str, method: str, *args: object) -> Future[Any]:
+        """Have a method called; arguments and result are copied.
+
+        Returns:
+            What it returns or raises, with the child's traceback as a note; ``ProcessLostError``
+            when the process is not there any more.
+        """
+        future: Future[Any] = Future()
+        with self._lock:
+            number = next(self._ids)
+            self._calls[number] = future
+            is_lost = self._is_lost
+        if is_lost:
+            self._answer(number, False, ProcessLostError("the process has ended"))
+        else:
+            self._writer.submit(self._write, number, lane, method, args)
+        return future
+
+    def usage(self) -> Usage:
+        """Return what the process has taken of the machine beyond what it shares with us."""
+        return usage_of(self._pid)
+
+    def end(self) -> None:
+        """End the process, whatever it is doing; what was asked for is lost."""
+        self._writer.shutdown(wait=False, cancel_futures=True)
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._reader.join()
+        self._socket.close()
+        until_s = time.monotonic() + _END_S
+        while not self._is_over():
+            if time.monotonic() >= until_s:
+                os.kill(self._pid, signal.SIGKILL)
+                os.waitpid(self._pid, 0)
+                break
+            time.sleep(_LOOK_S)
+
+    def _is_over(self) -> bool:
+        try:
+            return os.waitpid(self._pid, os.WNOHANG)[0] != 0
+        except ChildProcessError:
+            return True
+
+    def _write(self, number: int, lane: str, method: str, args: tuple[object, ...]) -> None:
+        try:
+            _send(self._socket, (number, lane, method, args))
+        except OSError:
+            self._answer(number, False, ProcessLostError("the process has ended"))
+        except Exception as error:  # what cannot be copied is the caller's mistake, nobody else's
+            self._answer(number, False, error)
+
+    def _read(self) -> None:
+        with contextlib.suppress(OSError, EOFError):
+            while True:
+                self._answer(*_receive(self._socket))
+        with self._lock:
+            self._is_lost = True
+            left = list(self._calls)
+        for number in left:
+            self._answer(number, False, ProcessLostError("the process has ended"))
+
+    def _answer(self, number: int, is_done: bool, result: Any) -> None:
+        with self._lock:
+            future = self._calls.pop(number, None)
+        if future is None or not future.set_running_or_notify_cancel():
+            return
+        if is_done:
+            future.set_result(result)
+        else:
+            future.set_exception(result)
+
+
+def _serve(connection: socket.socket, target: object, lanes: Mapping[str, int]) -> None:
+    """Do what is asked for until the other side hangs up, and end the process."""
+    try:
+        _leave_parent(connection.fileno())
+        workers = {name: Worker(name, yields) for name, yields in lanes.items()}
+        answering = threading.Lock()
+        with contextlib.suppress(OSError, EOFError):
+            while True:
+                number, lane, method, args = _receive(connection)
+                workers[lane].submit(_do, connection, answering, number, target, method, args)
+                del args
+    except BaseException:
+        traceback.print_exc()
+        sys.stderr.flush()
+        os._exit(1)
+    # Threads are not waited for: nobody is there whom their results concern.
+    os._exit(0)
+
+
+def _leave_parent(keep: int) -> None:
+    """Let go of what is the parent's: its signals, and its files and sockets but one."""
+    signal.set_wakeup_fd(-1)
+    for end in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(end, signal.SIG_IGN)
+    for name in os.listdir("/dev/fd"):
+        number = int(name)
+        if number > 2 and number != keep:
+            with contextlib.suppress(OSError):  # the listing's own is gone by now
+                os.close(number)
+
+
+def _do(
+    connection: socket.socket,
+    answering: threading.Lock,
+    number: int,
+    target: object,
+    method: str,
+    args: tuple[object, ...],
+) -> None:
+    """Call a method and send what came of it."""
+    is_done, result = True, None
+    try:
+        result = getattr(target, method)(*args)
+    except Exception as error:
+        is_done, result = False, _portable(error)
+    del args
+    try:
+        with answering:
+            _send(connection, (number, is_done, result))
+    except OSError:
+        os._exit(0)
+    except Exception as error:  # pickle raises whatever it likes, before a byte is sent
+        with answering:
+            _send(connection, (number, False, _portable(error)))
+
+
+def _portable(error: Exception) -> Exception:
+    """Return an exception that the other side can read, with its traceback as a note."""
+    error.add_note("".join(traceback.format_exception(error)).rstrip())
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        told = RuntimeError(f"{type(error).__name__}: {error}")
+        told.add_note("".join(traceback.format_exception(error)).rstrip())
+        return told
+    return error
+
+
+def _send(connection: socket.socket, message: object) -> None:
+    """Send a message: number of arrays, bytes of the stream, bytes of each array; then these."""
+    arrays: list[pickle.PickleBuffer] = []
+    stream = pickle.dumps(message, protocol=_PROTOCOL, buffer_callback=arrays.append)
+    parts = [array.raw() for array in arrays]
+    sizes = b"".join(_SIZE.pack(part.nbytes) for part in parts)
+    connection.sendall(_HEAD.pack(len(parts), len(stream)) + sizes + stream)
+    for part in parts:
+        connection.sendall(part)
+
+
+def _receive(connection: socket.socket) -> Any:
+    """Wait for a message.
+
+    Raises:
+        EOFError: the other side has hung up.
+    """
+    n_arrays, n_stream = _HEAD.unpack(_exactly(connection, _HEAD.size))
+    sizes = _exactly(connection, n_arrays * _SIZE.size)
+    stream = _exactly(connection, n_stream)
+    arrays = [_exactly(connection, size) for (size,) in _SIZE.iter_unpack(sizes)]
+    return pickle.loads(stream, buffers=arrays)
+
+
+def _exactly(connection: socket.socket, n: int) -> bytearray:
+    data = bytearray(n)
+    rest = memoryview(data)
+    while rest:
+        got = connection.recv_into(rest)
+        if got == 0:
+            raise EOFError("the other side has hung up")
+        rest = rest[got:]
+    return data

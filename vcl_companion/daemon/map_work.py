@@ -1,0 +1,129 @@
+"""The workshop as the event loop sees it: in a process of its own, and never waited for."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from vcl_companion.cameras.source import Frame
+from vcl_companion.daemon.forked import Forked, ProcessLostError
+from vcl_companion.daemon.map_offer import HandOut, MapOffer, ReadyMap
+from vcl_companion.daemon.map_store import StoredMap
+from vcl_companion.daemon.usage import Usage
+from vcl_companion.daemon.worker import Worker
+from vcl_companion.daemon.workshop import NotHereError, Workshop
+from vcl_companion.localization.inter import NoProposal, Proposal
+from vcl_companion.localization.map_index import MapIndex
+from vcl_companion.localization.pose_filter import FilterState
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.options import NoMap
+from vcl_companion.wire.frame_codec import FrameAnswer
+
+_log = logging.getLogger(__name__)
+
+_MAPS, _PEERS = "maps", "peers"
+# Niceness of map making above the frames', and of looking for peers' poses.
+_LANES = {_MAPS: 8, _PEERS: 12}
+
+
+class MapWork:
+    """Has a workshop do things; each method waits for what its namesake returns or raises.
+
+    Args:
+        workshop: what does it.
+        forks: whether in a process of its own, which begins now: no other thread may be at
+            work. Should it be lost, or with False, threads of this process do the work.
+    """
+
+    def __init__(self, workshop: Workshop, *, forks: bool) -> None:
+        self._workshop = workshop
+        self._process = Forked(workshop, _LANES) if forks else None
+        self._threads: dict[str, Worker] = {}
+
+    async def look_at(self, frame: FrameAnswer) -> None:
+        """See ``Workshop``."""
+        await self._do(_MAPS, "look_at", frame)
+
+    async def first_map(self, frames: list[FrameAnswer], leader: int) -> LandmarkMap | NoMap:
+        """See ``Workshop``."""
+        built: LandmarkMap | NoMap = await self._do(_MAPS, "first_map", frames, leader)
+        return built
+
+    async def next_revision(
+        self, stored: StoredMap, frames: list[FrameAnswer], *, at_once: bool
+    ) -> LandmarkMap | NoMap:
+        """See ``Workshop``."""
+        built: LandmarkMap | NoMap = await self._do_with(
+            stored, _MAPS, "next_revision", stored.revision, frames, at_once
+        )
+        return built
+
+    async def encoded(self, built: LandmarkMap, parent: StoredMap | None) -> HandOut:
+        """See ``Workshop``."""
+        name = b"" if parent is None else parent.revision
+        encoded: HandOut = await self._do_with(parent, _MAPS, "encoded", built, name)
+        return encoded
+
+    async def ready(
+        self, offer: MapOffer, current: StoredMap | None, held: Mapping[bytes, bytes]
+    ) -> ReadyMap:
+        """See ``Workshop``."""
+        name = b"" if current is None else current.revision
+        ready: ReadyMap = await self._do_with(current, _MAPS, "ready", offer, name, held)
+        return ready
+
+    async def more_indexed(self, stored: StoredMap) -> MapIndex:
+        """See ``Workshop``."""
+        index: MapIndex = await self._do_with(stored, _PEERS, "more_indexed", stored.revision)
+        return index.of_the_same_map(stored.index)
+
+    async def place_of_peer(
+        self, frame: Frame, state: FilterState, stored: StoredMap, seen: FrameAnswer
+    ) -> Proposal | NoProposal:
+        """See ``Workshop``."""
+        said: Proposal | NoProposal = await self._do_with(
+            stored, _PEERS, "place_of_peer", frame, state, stored.revision, seen
+        )
+        return said
+
+    def end(self) -> Usage:
+        """Stop working, whatever is under way; return what the process has taken."""
+        for thread in self._threads.values():
+            thread.shutdown(wait=False, cancel_futures=True)
+        if self._process is None:
+            return Usage()
+        usage = self._process.usage()
+        self._process.end()
+        return usage
+
+    def ends_with(self, exit_status: int) -> None:
+        """Say what a process ends with whose threads still work; see ``Worker``."""
+        for thread in self._threads.values():
+            thread.exit_status = exit_status
+
+    async def _do_with(
+        self, stored: StoredMap | None, lane: str, method: str, *args: object
+    ) -> Any:
+        """Have something done with a map, which is handed over if it is not there."""
+        try:
+            return await self._do(lane, method, *args)
+        except NotHereError:
+            await self._do(lane, "learn", stored)
+            return await self._do(lane, method, *args)
+
+    async def _do(self, lane: str, method: str, *args: object) -> Any:
+        process = self._process
+        if process is not None:
+            try:
+                return await asyncio.wrap_future(process.call(lane, method, *args))
+            except ProcessLostError:
+                if self._process is process:
+                    _log.error("the process that makes maps was lost; threads go on with it")
+                    self._process = None
+                    process.end()
+        if lane not in self._threads:
+            self._threads[lane] = Worker(lane, _LANES[lane])
+        do = getattr(self._workshop, method)
+        return await asyncio.get_running_loop().run_in_executor(self._threads[lane], do, *args)

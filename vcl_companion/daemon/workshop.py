@@ -1,0 +1,162 @@
+"""What takes seconds: maps built, made ready to be flown on, and looked up for peers.
+
+It keeps what it has made and found, so that a map is named rather than handed over
+once more. One thread makes maps, another one looks for peers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from vcl_companion.cameras.source import Frame
+from vcl_companion.daemon.feature_memory import FeatureMemory
+from vcl_companion.daemon.map_building import Distances, build_map, update_map
+from vcl_companion.daemon.map_offer import HandOut, MapOffer, ReadyMap, ready_map, with_fallbacks
+from vcl_companion.daemon.map_store import StoredMap
+from vcl_companion.daemon.peer_look import PeerLook
+from vcl_companion.daemon.usage import give_back_freed
+from vcl_companion.localization.inter import NoProposal, Proposal
+from vcl_companion.localization.map_index import MapIndex
+from vcl_companion.localization.pose_filter import FilterState
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.options import MapOptions, NoMap
+from vcl_companion.recording.sensor import Sensor
+from vcl_companion.swarm.pose_requests import InterMavOptions
+from vcl_companion.vision.features import Detector, FeatureOptions
+from vcl_companion.wire.frame_codec import FrameAnswer
+from vcl_companion.wire.map_codec import encode_map, revision_of
+from vcl_companion.wire.map_update import encode_map_update
+
+# The one in use, the next one, and one that somebody still looks at.
+_N_MAPS = 3
+
+
+class NotHereError(Exception):
+    """A map that is named has to be handed over first."""
+
+
+@dataclass(frozen=True)
+class WorkOptions:
+    """How the work is done.
+
+    Attributes:
+        known_distances: (drone, drone, metres).
+        map: thresholds of the building.
+        features: how they are found.
+        detectors: the localization's own, and what it falls back on.
+        inter: of looking for peers.
+        tracked: whether maps are made ready to be tracked by their patches; then every
+            index that there is is tried for a peer as well.
+    """
+
+    known_distances: Distances
+    map: MapOptions
+    features: FeatureOptions
+    detectors: tuple[Detector, ...]
+    inter: InterMavOptions
+    tracked: bool
+
+
+class Workshop:
+    """Does the work; see the module.
+
+    Args:
+        sensor: of our camera.
+        options: how.
+    """
+
+    def __init__(self, sensor: Sensor, options: WorkOptions) -> None:
+        self._options = options
+        self._memory = FeatureMemory(options.features)
+        self._other_memory = FeatureMemory(options.features)  # the other thread's
+        self._look = PeerLook(
+            sensor, options.features, options.inter, options.detectors, options.tracked
+        )
+        self._maps: dict[bytes, StoredMap] = {}
+
+    def learn(self, stored: StoredMap) -> None:
+        """Take a map that was made elsewhere, or before this workshop was."""
+        self._maps.pop(stored.revision, None)
+        self._maps[stored.revision] = stored
+        while len(self._maps) > _N_MAPS:
+            del self._maps[next(iter(self._maps))]
+
+    def look_at(self, frame: FrameAnswer) -> None:
+        """Find the features of a frame that a map will be made of, before it is.
+
+        Raises:
+            ValueError: its image cannot be used.
+        """
+        detector = self._options.detectors[0]
+        self._memory.features(frame.image_bytes, frame.camera, detector)
+
+    def first_map(self, frames: list[FrameAnswer], leader: int) -> LandmarkMap | NoMap:
+        """Build the first map of a round's frames; see ``build_map``."""
+        options = self._options
+        return build_map(frames, leader, options.known_distances, options.map, self._memory)
+
+    def next_revision(
+        self, revision: bytes, frames: list[FrameAnswer], at_once: bool
+    ) -> LandmarkMap | NoMap:
+        """Build the next revision of a map; see ``update_map``."""
+        stored = self._named(revision)
+        return update_map(stored, frames, self._options.map, self._memory, at_once=at_once)
+
+    def encoded(self, built: LandmarkMap, parent: bytes) -> HandOut:
+        """Return a map as peers get it, and for those who have its parent (empty: nobody).
+
+        Raises:
+            ValueError: the map breaks a bound that peers hold every map to.
+        """
+        data = encode_map(built)
+        update = b""
+        if parent:
+            update = encode_map_update(data, self._named(parent).index.landmark_map)
+        return HandOut(revision_of(data), built.parent, data, update)
+
+    def ready(self, offer: MapOffer, current: bytes, held: Mapping[bytes, bytes]) -> ReadyMap:
+        """Make a map ready to be flown on, and keep it; see ``ready_map``.
+
+        Args:
+            offer: what came or was made.
+            current: the map in use; empty for none.
+            held: images that were sent ahead, by their names.
+
+        Raises:
+            WireError: the bytes are no map.
+            ValueError: it cannot be used.
+        """
+        options = self._options
+        stored = self._named(current) if current else None
+        ready = ready_map(
+            offer, stored, options.detectors[0], options.features, self._memory,
+            options.tracked, held,
+        )  # fmt: skip
+        self.learn(ready.stored())
+        give_back_freed()  # making it took a hundred megabytes more than it is
+        return ready
+
+    def more_indexed(self, revision: bytes) -> MapIndex:
+        """Return a map's index with those by the other detectors to fall back on."""
+        stored = self._named(revision)
+        options = self._options
+        index = with_fallbacks(
+            stored.index, options.detectors[1:], options.features, self._other_memory
+        )
+        if revision in self._maps:
+            self._maps[revision] = replace(stored, index=index)
+        give_back_freed()
+        return index
+
+    def place_of_peer(
+        self, frame: Frame, state: FilterState, revision: bytes, seen: FrameAnswer
+    ) -> Proposal | NoProposal:
+        """Propose where the drone was that saw a frame; see ``PeerLook``."""
+        return self._look.from_frame(frame, state, self._named(revision), seen)
+
+    def _named(self, revision: bytes) -> StoredMap:
+        try:
+            return self._maps[revision]
+        except KeyError:
+            raise NotHereError from None
