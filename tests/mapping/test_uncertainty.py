@@ -119,6 +119,37 @@ def test_keyframes_and_landmarks_err_as_much_as_stated() -> None:
     assert float(alone.mean()) > 2.0 * float(nees(points, point_sigma).mean())
 
 
+def test_whatever_the_first_keyframe_is_off_by_everything_is() -> None:
+    scene = facade_scene(np.random.default_rng(3), 60, relief_m=4.0, n_views=3, noise_px=0.3)
+    truth = map_of(scene)
+    sigma = np.array([0.3, 0.2, 0.4, 0.02, 0.03, 0.05])
+    exact, moved = (
+        map_uncertainty(replace(truth, anchor_covariance=scale * np.diag(sigma**2)))
+        for scale in (0.0, 1.0)
+    )
+    first = truth.keyframes[0].world_from_body
+    step = 1e-6
+    for i, keyframe in enumerate(truth.keyframes):
+        relative = first.inverse() @ keyframe.world_from_body
+        columns = [
+            keyframe.world_from_body.local(first.retracted(step * e) @ relative) / step
+            for e in np.eye(6)
+        ]
+        alike = np.stack(columns, axis=1)
+        block = np.s_[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
+        added = moved.keyframe_covariance[block] - exact.keyframe_covariance[block]
+        np.testing.assert_allclose(added, alike @ np.diag(sigma**2) @ alike.T, atol=1e-6)
+    for j in (0, 17, 40):
+        point = first.inverse().apply(truth.points_world[j])
+        columns = [
+            (first.retracted(step * e).apply(point) - truth.points_world[j]) / step
+            for e in np.eye(6)
+        ]
+        alike = np.stack(columns, axis=1)
+        added = moved.marginal()[j] - exact.marginal()[j]
+        np.testing.assert_allclose(added, alike @ np.diag(sigma**2) @ alike.T, atol=1e-5, rtol=1e-3)
+
+
 def test_a_better_known_distance_is_a_better_scale() -> None:
     scene = facade_scene(np.random.default_rng(0), 100, relief_m=4.0, noise_px=0.3)
     direction = np.concatenate([scene.bodies[1].rotation.T @ scene.bodies[1].translation, [0] * 3])

@@ -101,7 +101,9 @@ def sigma_m(landmark_map: LandmarkMap, i: int) -> float:
     return float(np.sqrt(np.trace(covariance[6 * i : 6 * i + 3, 6 * i : 6 * i + 3])))
 
 
-def assert_right(found: LandmarkMap, scene: Scene, views: list[DroneView]) -> None:
+def assert_right(
+    found: LandmarkMap, scene: Scene, views: list[DroneView], within_m: float = 0.15
+) -> None:
     """Assert that every keyframe is where its view was, within what the map says of itself."""
     covariance = map_uncertainty(found).keyframe_covariance
     for i, keyframe in enumerate(found.keyframes[1:], start=1):
@@ -112,7 +114,7 @@ def assert_right(found: LandmarkMap, scene: Scene, views: list[DroneView]) -> No
         own = covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
         # 99.99 % of chi-square with 6 degrees of freedom.
         assert error @ np.linalg.solve(own, error) < 27.9, (i, error)
-        assert_pose_close(keyframe.world_from_body, truth, within_m=0.15, within_rad=0.01)
+        assert_pose_close(keyframe.world_from_body, truth, within_m=within_m, within_rad=0.01)
 
 
 def test_new_views_carry_the_map_along_the_street() -> None:
@@ -311,10 +313,41 @@ def test_the_number_of_keyframes_and_landmarks_is_bounded() -> None:
     assert len(found.keyframes) == 5
     assert len(found.points_world) == 200
     names = [k.captured_at_ns - 1_000_000 for k in found.keyframes]
-    # The leader's first and the end of the known distance carry frame and scale.
-    assert names == [0, 1, 5, 6, 7]
-    assert found.distances[0].keyframe_b == 1
+    assert names == [0, 4, 5, 6, 7]
+    # The leader's first still fixes the frame; the known distance went with the other drone's.
+    assert not found.anchor_covariance.any()
+    (distance,) = found.distances
+    assert distance.keyframe_a == 0
+    truth_m = scene.baseline_m(0, names[distance.keyframe_b])
+    assert abs(distance.distance_m - truth_m) < 4.0 * distance.sigma_m
     assert_right(found, scene, views)
+
+
+def test_a_map_goes_on_when_its_beginning_is_too_far_behind() -> None:
+    """Frame and scale pass to what is left, as well known as that is by then."""
+    rng = np.random.default_rng(13)
+    later = tuple(at(-1.0, 2.7 * n, 0.3 * (-1) ** n, 1.0) for n in range(1, 16))
+    ids = [1, 2, 3] + [1 + n % 3 for n in range(15)]
+    scene, views = flight(rng, FIRST + later, ids)
+    options = replace(OPTIONS, max_keyframes=6)
+    found = first_map(scene, views)
+    sigmas = []
+    for k in range(3, 18, 3):
+        found = grown(found, views, views[k : k + 3], options)
+        sigmas.append(sigma_m(found, 0))
+    names = [k.captured_at_ns - 1_000_000 for k in found.keyframes]
+    assert names[0] > 5
+    assert names[-3:] == [15, 16, 17]
+    assert sigmas[0] == 0.0
+    assert 0.0 < sigmas[-2] < sigmas[-1] < 0.2
+    (distance,) = found.distances
+    truth_m = scene.baseline_m(names[0], names[distance.keyframe_b])
+    assert 1e-3 * truth_m < distance.sigma_m < 0.02 * truth_m
+    assert abs(distance.distance_m - truth_m) < 4.0 * distance.sigma_m
+    assert_right(found, scene, views, within_m=0.5)
+    truth = world_from_scene() @ scene.bodies[names[0]]
+    error = truth.local(found.keyframes[0].world_from_body)
+    assert error @ np.linalg.solve(found.anchor_covariance, error) < 27.9
 
 
 def test_the_update_of_a_seed_is_one_update() -> None:

@@ -44,6 +44,7 @@ def assert_maps_close(a: LandmarkMap, b: LandmarkMap) -> None:
     assert np.abs(a.observed_px - b.observed_px)[a.seen].max(initial=0.0) <= 2.0**-7
     for name in ("pixel_noise_px", "detectors", "distances", "parent"):
         assert getattr(a, name) == getattr(b, name)
+    assert np.array_equal(a.anchor_covariance, b.anchor_covariance)
 
 
 def test_golden_bytes() -> None:
@@ -182,7 +183,37 @@ def test_the_codec_carries_every_field_of_a_map() -> None:
         "detectors",
         "distances",
         "parent",
+        "anchor_covariance",
     }
+
+
+def anchored_map() -> LandmarkMap:
+    """The small map, its first keyframe known to 1 to 6 cm and tenths of a degree."""
+    sigma = np.array([0.01, 0.02, 0.06, 0.001, 0.002, 0.003])
+    alike = np.where(np.eye(6) > 0, 1.0, 0.25)
+    return replace(small_map(), anchor_covariance=sigma[:, None] * alike * sigma)
+
+
+def test_golden_bytes_of_a_map_that_began_elsewhere() -> None:
+    data = encode_map(anchored_map())
+    assert_golden("map_anchored", data)
+    assert len(data) == len(encode_map(small_map())) + 21 * 8
+    decoded = decode_map(data)
+    assert_maps_close(decoded, anchored_map())
+    assert encode_map(decoded) == data
+
+
+def test_what_is_no_covariance_of_the_first_keyframe_is_refused() -> None:
+    data = encode_map(anchored_map())
+    at = len(bytes([PROTOCOL_VERSION, BlobKind.MAP])) + struct.calcsize("<BBHHId8s")
+    for numbers in ([0.0] * 21, [float("nan")] * 21, [-1.0] * 21, [1.0] + [9.0] * 20):
+        broken = data[:at] + struct.pack("<21d", *numbers) + data[at + 21 * 8 :]
+        with pytest.raises(WireError, match="covariance of its first keyframe"):
+            decode_map(broken)
+    with pytest.raises(WireError, match="unknown detectors"):
+        decode_map(data[:2] + bytes([8]) + data[3:])
+    with pytest.raises(ValueError, match="anchor_covariance must be a covariance"):
+        replace(small_map(), anchor_covariance=-np.eye(6))
 
 
 @given(st.one_of(st.just(b""), st.binary(min_size=8, max_size=8)))

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.mapping.culling import Mask
 from vcl_companion.mapping.growth import Growth
 from vcl_companion.mapping.landmark_map import KnownDistance, LandmarkMap
 from vcl_companion.mapping.options import MapOptions
-from vcl_companion.mapping.uncertainty import MapUncertainty
+from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
 
 # Squared Mahalanobis distance in three dimensions that one in 10 000 exceeds.
 _CHI2_3_9999 = 21.1
@@ -18,6 +22,12 @@ _CHI2_3_9999 = 21.1
 _MAX_MOVED = 0.1
 # An encoded map has to pass as one blob of 8 MiB, its table of pixels included.
 MAX_IMAGE_BYTES = 6 * 1024 * 1024
+# Landmarks that two keyframes share if they are to hold each other.
+_LINK = 40
+# What carries frame and scale is worth so many times what it shows.
+_CARRYING = 2.0
+# A distance that is to carry the scale on is at least so long, and not known better than this.
+_LEAST_DISTANCE_M, _FINEST = 0.1, 1e-5
 
 
 def broken_continuity(old: LandmarkMap, sure: MapUncertainty, growth: Growth) -> str:
@@ -42,27 +52,35 @@ def broken_continuity(old: LandmarkMap, sure: MapUncertainty, growth: Growth) ->
 def pruned(landmark_map: LandmarkMap, n_old: int, options: MapOptions) -> LandmarkMap:
     """Drop keyframes and landmarks that contribute least until the map is within its bounds.
 
-    Keyframes that carry frame or scale stay, and so do the new ones.
+    New keyframes stay. Where the first one goes, or the last known distance, the next one
+    takes its place, as well known as it is by then: what is too old to matter is summed up
+    in that (marginalized).
 
     Args:
         landmark_map: the extended map.
         n_old: how many of its keyframes are old, they come first.
         options: the bounds.
+
+    Raises:
+        ValueError: the map's observations do not fix it.
     """
-    while True:
+    whole, left = landmark_map, list(range(len(landmark_map.keyframes)))
+    while n_old > 0:
         keyframes = landmark_map.keyframes
         size = sum(len(k.image_bytes) for k in keyframes)
         if len(keyframes) <= options.max_keyframes and size <= MAX_IMAGE_BYTES:
             break
-        held = {0} | {k for d in landmark_map.distances for k in (d.keyframe_a, d.keyframe_b)}
-        free = [k for k in range(n_old) if k not in held]
-        if not free:
-            break
         seen = landmark_map.seen
         # A landmark that few others see is mostly this keyframe's own.
         worth = (seen / np.maximum(seen.sum(axis=1, keepdims=True) - 1, 1)).sum(axis=0)
-        landmark_map = _without(landmark_map, min(free, key=lambda k: float(worth[k])))
+        carrying = {0} | {k for d in landmark_map.distances for k in (d.keyframe_a, d.keyframe_b)}
+        worth[list(carrying)] *= _CARRYING
+        k = _least_missed(landmark_map, worth[:n_old])
+        landmark_map = _without(landmark_map, k)
+        del left[k]
         n_old -= 1
+    if left[0] != 0 or (whole.distances and not landmark_map.distances):
+        landmark_map = _anchored_anew(landmark_map, whole, left)
     excess = len(landmark_map.points_world) - options.max_landmarks
     if excess > 0:
         # The longest tracks stay; of equal ones the older.
@@ -73,13 +91,75 @@ def pruned(landmark_map: LandmarkMap, n_old: int, options: MapOptions) -> Landma
     return landmark_map
 
 
+def _least_missed(landmark_map: LandmarkMap, worth: Array) -> int:
+    """Return the keyframe worth least of those without which the others hang together as before.
+
+    Args:
+        landmark_map: all of it.
+        worth: of the keyframes that may go; they come first.
+    """
+    seen = landmark_map.seen.astype(np.int64)
+    linked = seen.T @ seen >= _LINK
+    n_before = _n_parts(linked)
+    for k in np.argsort(worth, kind="stable"):
+        if _n_parts(_less(linked, int(k))) <= n_before:
+            return int(k)
+    return 0
+
+
+def _n_parts(linked: Mask) -> int:
+    """Return into how many parts keyframes fall, and by how many more without any one of them.
+
+    Two parts that a single keyframe joins may each have a scale of its own.
+    """
+    count = int(connected_components(linked, directed=False)[0])
+    return count + sum(
+        max(int(connected_components(_less(linked, k), directed=False)[0]) - count, 0)
+        for k in range(len(linked))
+    )
+
+
+def _less(linked: Mask, k: int) -> Mask:
+    return np.asarray(np.delete(np.delete(linked, k, axis=0), k, axis=1))
+
+
+def _anchored_anew(landmark_map: LandmarkMap, whole: LandmarkMap, left: list[int]) -> LandmarkMap:
+    """Return a map with frame and scale as they were in the whole that this is left of."""
+    covariance = map_uncertainty(whole).keyframe_covariance
+    anchor = covariance[6 * left[0] :, 6 * left[0] :][:6, :6]
+    distances = landmark_map.distances
+    if whole.distances and not distances:
+        bodies = [k.world_from_body for k in landmark_map.keyframes]
+        known = [
+            _known_distance(n, bodies, covariance, left)
+            for n in range(1, len(bodies))
+            if np.linalg.norm(bodies[n].translation - bodies[0].translation) > _LEAST_DISTANCE_M
+        ]
+        if not known:
+            raise ValueError("the map's observations do not fix it")
+        distances = (min(known, key=lambda d: d.sigma_m / d.distance_m),)
+    return replace(landmark_map, anchor_covariance=0.5 * (anchor + anchor.T), distances=distances)
+
+
+def _known_distance(
+    n: int, bodies: list[Pose], covariance: Array, left: list[int]
+) -> KnownDistance:
+    """Return how far a keyframe is from the first one, and how well that is known."""
+    line = bodies[n].translation - bodies[0].translation
+    distance_m = float(np.linalg.norm(line))
+    change = np.zeros(len(covariance))
+    for sign, place, body in ((-1.0, left[0], bodies[0]), (1.0, left[n], bodies[n])):
+        change[6 * place : 6 * place + 3] = sign * body.rotation.T @ line / distance_m
+    sigma_m = math.sqrt(max(float(change @ covariance @ change), 0.0))
+    return KnownDistance(0, n, distance_m, max(sigma_m, _FINEST * distance_m))
+
+
 def _without(landmark_map: LandmarkMap, k: int) -> LandmarkMap:
     """Return the map without a keyframe, and without what it alone had seen with one other."""
-    observed = np.delete(landmark_map.observed_px, k, axis=1)
     shorter = replace(
         landmark_map,
         keyframes=landmark_map.keyframes[:k] + landmark_map.keyframes[k + 1 :],
-        observed_px=observed,
+        observed_px=np.delete(landmark_map.observed_px, k, axis=1),
         distances=tuple(
             KnownDistance(
                 d.keyframe_a - (d.keyframe_a > k),
@@ -88,12 +168,13 @@ def _without(landmark_map: LandmarkMap, k: int) -> LandmarkMap:
                 d.sigma_m,
             )
             for d in landmark_map.distances
+            if k not in (d.keyframe_a, d.keyframe_b)
         ),
     )
     return _of(shorter, shorter.seen.sum(axis=1) >= 2)
 
 
-def _of(landmark_map: LandmarkMap, keep: NDArray[np.bool_]) -> LandmarkMap:
+def _of(landmark_map: LandmarkMap, keep: Mask) -> LandmarkMap:
     return replace(
         landmark_map,
         points_world=landmark_map.points_world[keep],

@@ -7,13 +7,14 @@ it follows from the geometry (``map_uncertainty``).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.vision.information import is_covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,8 @@ class LandmarkMap:
     """One immutable revision of the shared map.
 
     Attributes:
-        keyframes: V images, the first one taken by the leader fixes the frame.
+        keyframes: V images; the first one fixes the frame, the leader's of the start until
+            that is too old to matter.
         points_world: (N, 3) landmarks, world frame, m.
         observed_px: (N, V, 2) pixel of every landmark in every keyframe's raw
             image; NaN where it was not seen there.
@@ -60,6 +62,8 @@ class LandmarkMap:
         detectors: which features the landmarks are: akaze, sift, orb.
         distances: what the scale rests on.
         parent: revision this one was made from; empty for a first map.
+        anchor_covariance: (6, 6) local, m and rad, of the first keyframe in the world: none
+            at the start, later what was known of its successor when it took its place.
     """
 
     keyframes: tuple[Keyframe, ...]
@@ -69,10 +73,16 @@ class LandmarkMap:
     detectors: tuple[str, ...]
     distances: tuple[KnownDistance, ...]
     parent: bytes
+    anchor_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
     def __post_init__(self) -> None:
         n, v = len(self.points_world), len(self.keyframes)
-        for name, shape in (("points_world", (n, 3)), ("observed_px", (n, v, 2))):
+        shapes = {
+            "points_world": (n, 3),
+            "observed_px": (n, v, 2),
+            "anchor_covariance": (6, 6),
+        }
+        for name, shape in shapes.items():
             value = np.array(getattr(self, name), dtype=np.float64)
             if value.shape != shape:
                 raise ValueError(f"LandmarkMap.{name} has shape {value.shape}, expected {shape}")
@@ -80,6 +90,8 @@ class LandmarkMap:
             object.__setattr__(self, name, value)
         if not np.all(np.isfinite(self.points_world)):
             raise ValueError("LandmarkMap.points_world must be finite")
+        if not is_covariance(self.anchor_covariance):
+            raise ValueError("LandmarkMap.anchor_covariance must be a covariance")
         if not (np.isfinite(self.pixel_noise_px) and self.pixel_noise_px > 0):
             raise ValueError(f"LandmarkMap.pixel_noise_px must be positive: {self.pixel_noise_px}")
         for distance in self.distances:

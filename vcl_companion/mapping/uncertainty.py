@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vcl_companion.geometry.pose import adjoint
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
@@ -93,6 +94,11 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
         reduced = system.pose_block - eliminated(system.cross, inverse, system.seen)
         covariance = np.zeros_like(reduced)
         covariance[6:, 6:] = _inverse(reduced[6:, 6:])
+        if landmark_map.anchor_covariance.any():
+            # Whatever the first keyframe is off by, all are, and so are the landmarks.
+            first = landmark_map.keyframes[0].world_from_body
+            alike = np.vstack([adjoint(body.inverse() @ first) for body in views.bodies])
+            covariance += alike @ landmark_map.anchor_covariance @ alike.T
     return MapUncertainty(covariance, inverse, lever)
 
 

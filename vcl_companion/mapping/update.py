@@ -104,7 +104,10 @@ def extended(
     reason = broken_continuity(old, sure, growth)
     if reason:
         return NoMap(reason)
-    made = pruned(replace(growth.landmark_map, parent=parent), len(old.keyframes), options)
+    try:
+        made = pruned(replace(growth.landmark_map, parent=parent), len(old.keyframes), options)
+    except ValueError as error:
+        return NoMap(str(error))
     return accepted(made, options)
 
 

@@ -6,6 +6,8 @@ import numpy as np
 
 from vcl_companion.geometry.rotation import Array
 
+_ROUNDING = 1e-9
+
 
 def covariance_of(information: Array, least_eigenvalue: float) -> Array | None:
     """Invert normal matrices that fix what they are about.
@@ -27,3 +29,14 @@ def covariance_of(information: Array, least_eigenvalue: float) -> Array | None:
             return None
         out = np.linalg.inv(unit) / scale
     return np.asarray(0.5 * (out + np.swapaxes(out, -1, -2)))
+
+
+def is_covariance(matrix: Array) -> bool:
+    """Whether a (K, K) matrix is finite, symmetric and has no negative eigenvalue."""
+    if not (np.all(np.isfinite(matrix)) and np.array_equal(matrix, matrix.T)):
+        return False
+    sigma = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    sigma = np.where(sigma > 0.0, sigma, 1.0)
+    with np.errstate(all="ignore"):
+        unit = matrix / sigma[:, None] / sigma
+    return bool(np.all(np.isfinite(unit)) and np.linalg.eigvalsh(unit)[0] >= -_ROUNDING)

@@ -17,6 +17,7 @@ import numpy as np
 from vcl_companion.errors import WireError
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
+from vcl_companion.vision.information import is_covariance
 from vcl_companion.wire.columns import (
     Integers,
     encode_bits,
@@ -49,7 +50,7 @@ MAX_CELLS = 1 << 20  # landmarks times keyframes: bounds the observation table
 MAX_DISTANCES = 256
 
 # Head, after version and kind
-# | 2  | u8      | detectors: 1 akaze + 2 sift + 4 orb     |
+# | 2  | u8      | detectors: 1 akaze + 2 sift + 4 orb; + 8: the first keyframe is not exact |
 # | 3  | u8      | bytes of the parent revision: 0 or 8    |
 # | 4  | u16     | keyframes V, at least 1                 |
 # | 6  | u16     | known distances D                       |
@@ -58,6 +59,11 @@ MAX_DISTANCES = 256
 # | 20 | 8 bytes | parent revision, zeros when there is none |
 _HEAD = struct.Struct("<BBHHId8s")
 _DETECTORS = ("akaze", "sift", "orb")  # bit by bit
+_ANCHORED = 1 << len(_DETECTORS)
+
+# If it is not: 21 x f64, its covariance's upper triangle by rows, m and rad
+_ANCHOR = struct.Struct("<21d")
+_UPPER = np.triu_indices(6)
 
 # D times | 0 | 2 x u16 | keyframes a, b | then | 4 | 2 x f64 | distance, sigma, m |
 _DISTANCE = struct.Struct("<2H2d")
@@ -83,12 +89,21 @@ class MapHead:
     detectors: tuple[str, ...]
     distances: tuple[KnownDistance, ...]
     parent: bytes
+    anchor_covariance: Array
 
     @classmethod
     def of(cls, m: LandmarkMap) -> MapHead:
         """Return a map's."""
         n = len(m.points_world)
-        return cls(m.keyframes, n, m.pixel_noise_px, m.detectors, m.distances, m.parent)
+        return cls(
+            m.keyframes,
+            n,
+            m.pixel_noise_px,
+            m.detectors,
+            m.distances,
+            m.parent,
+            m.anchor_covariance,
+        )
 
     def map_with(self, points: Integers, pixels: Integers) -> LandmarkMap:
         """Return the map whose landmarks lie there.
@@ -110,6 +125,7 @@ class MapHead:
             detectors=self.detectors,
             distances=self.distances,
             parent=self.parent,
+            anchor_covariance=self.anchor_covariance,
         )
 
 
@@ -185,9 +201,10 @@ def encode_head(m: MapHead) -> bytes:
         raise ValueError(f"detectors must be some of {', '.join(_DETECTORS)}: {m.detectors}")
     if len(m.parent) not in (0, REVISION_BYTES):
         raise ValueError(f"a parent revision has 0 or {REVISION_BYTES} bytes: {m.parent!r}")
+    is_anchored = bool(m.anchor_covariance.any())
     parts = [
         _HEAD.pack(
-            detectors,
+            detectors | (_ANCHORED if is_anchored else 0),
             len(m.parent),
             n_keyframes,
             len(m.distances),
@@ -196,6 +213,8 @@ def encode_head(m: MapHead) -> bytes:
             m.parent,
         ),
     ]
+    if is_anchored:
+        parts.append(_ANCHOR.pack(*m.anchor_covariance[_UPPER]))
     for distance in m.distances:
         _check_distance(distance)
         parts.append(
@@ -244,10 +263,12 @@ def take_head(reader: Reader) -> MapHead:
     detectors, n_parent, n_keyframes, n_distances, n_landmarks, noise_px, parent = reader.unpack(
         _HEAD
     )
-    if not 0 < detectors < 1 << len(_DETECTORS):
+    is_anchored = bool(detectors & _ANCHORED)
+    if not (detectors & (_ANCHORED - 1) and detectors < 2 * _ANCHORED):
         raise WireError(f"map: unknown detectors {detectors:#x}")
     parent = _checked_parent(n_parent, parent)
     _check_counts(n_landmarks, n_keyframes, n_distances)
+    anchor = _take_anchor(reader) if is_anchored else np.zeros((6, 6))
     distances = tuple(KnownDistance(*reader.unpack(_DISTANCE)) for _ in range(n_distances))
     for distance in distances:
         _check_distance(distance)
@@ -258,7 +279,22 @@ def take_head(reader: Reader) -> MapHead:
         tuple(n for bit, n in enumerate(_DETECTORS) if detectors >> bit & 1),
         distances,
         parent,
+        anchor,
     )
+
+
+def _take_anchor(reader: Reader) -> Array:
+    """Return the covariance of a first keyframe that is not exact.
+
+    Raises:
+        WireError: it is none.
+    """
+    upper = np.zeros((6, 6))
+    upper[_UPPER] = reader.unpack(_ANCHOR)
+    covariance = upper + np.triu(upper, 1).T
+    if not (covariance.any() and is_covariance(covariance)):
+        raise WireError("map: not a covariance of its first keyframe")
+    return covariance
 
 
 def _checked_parent(n_bytes: int, padded: bytes) -> bytes:
