@@ -16,6 +16,7 @@ from scipy.special import gammaincinv
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, skew
 from vcl_companion.vision import bundle_kernels as kernels
+from vcl_companion.vision.compiled import writable
 
 _MIN_DEPTH_M = 1e-3
 
@@ -94,13 +95,9 @@ class NormalEquations:
 
 def reprojection_residuals(views: Views) -> Array:
     """Return (N, V, 2) projected minus observed, px; NaN where unseen or behind the camera."""
-    out = np.full(views.ideal.shape, np.nan)
-    for i in range(len(views.bodies)):
-        points_cam = _world_from_cam(views, i).inverse().apply(views.points)
-        z = np.where(points_cam[:, 2] > _MIN_DEPTH_M, points_cam[:, 2], np.nan)
-        error = points_cam[:, :2] / z[:, None] - views.ideal[:, i]
-        out[:, i] = np.einsum("nkl,nl->nk", views.slopes[:, i], error)
-    return out
+    cams = _matrices(tuple(_world_from_cam(views, i).inverse() for i in range(len(views.bodies))))
+    points, slopes, ideal = map(writable, (views.points, views.slopes, views.ideal))
+    return kernels.residuals(points, cams, slopes, ideal, _MIN_DEPTH_M)
 
 
 def adjust(views: Views, options: BundleOptions) -> tuple[Views, float]:
@@ -203,9 +200,7 @@ class _Problem:
         self, views: Views
     ) -> tuple[Array, Array, Array, kernels.Ints, kernels.Ints, Array, Array]:
         """Return an estimate as the compiled loops take it."""
-        # Writable as all others are: for one that is not the kernels would be compiled anew.
-        points = np.array(views.points)
-        bodies = _matrices(views.bodies)
+        points, bodies = writable(views.points), _matrices(views.bodies)
         return (
             points, bodies, self._mountings, self._first, self._view, self._slopes, self._ideal
         )  # fmt: skip

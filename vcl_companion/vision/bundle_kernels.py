@@ -71,6 +71,35 @@ def _linearized(
 
 
 @compiled
+def residuals(
+    points: Array, cams_from_world: Array, slopes: Array, ideal: Array, least_depth_m: float
+) -> Array:
+    """Return (N, V, 2) projected minus observed, px; NaN where unseen or not in front.
+
+    Args:
+        points: (N, 3).
+        cams_from_world: (V, 3, 4).
+        slopes: (N, V, 2, 2) pixels by ideal coordinates.
+        ideal: (N, V, 2) observed; NaN where unseen.
+        least_depth_m: what is nearer is not in front.
+    """
+    n, v = ideal.shape[0], ideal.shape[1]
+    out = np.full((n, v, 2), np.nan)
+    for j in range(n):
+        p = points[j]
+        for i in range(v):
+            c = cams_from_world[i]
+            z = c[2, 0] * p[0] + c[2, 1] * p[1] + c[2, 2] * p[2] + c[2, 3]
+            if np.isnan(ideal[j, i, 0]) or not z > least_depth_m:
+                continue
+            x = (c[0, 0] * p[0] + c[0, 1] * p[1] + c[0, 2] * p[2] + c[0, 3]) / z - ideal[j, i, 0]
+            y = (c[1, 0] * p[0] + c[1, 1] * p[1] + c[1, 2] * p[2] + c[1, 3]) / z - ideal[j, i, 1]
+            out[j, i, 0] = slopes[j, i, 0, 0] * x + slopes[j, i, 0, 1] * y
+            out[j, i, 1] = slopes[j, i, 1, 0] * x + slopes[j, i, 1, 1] * y
+    return out
+
+
+@compiled
 def cost_of(
     points: Array,
     bodies: Array,

@@ -10,9 +10,12 @@ from collections.abc import Callable
 from typing import ParamSpec, TypeVar, cast
 
 import numba
+import numpy as np
+from numpy.typing import NDArray
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+_Number = TypeVar("_Number", bound=np.generic)
 
 
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -35,3 +38,8 @@ def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
     except RuntimeError:  # "no locator available": there is no folder to keep it in
         kept = compiler(function)
     return cast("Callable[_P, _R]", kept)
+
+
+def writable(values: NDArray[_Number]) -> NDArray[_Number]:
+    """Return an array as kernels take all of theirs: for another kind they are compiled anew."""
+    return np.require(values, requirements=["C", "W"])

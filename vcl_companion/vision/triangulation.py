@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.vision.compiled import compiled, writable
 
 
 def triangulate(worlds_from_cams: list[Pose], ideal: Array) -> Array:
@@ -55,15 +56,32 @@ def ray_angles(worlds_from_cams: list[Pose], points: Array, seen: NDArray[np.boo
         points: (N, 3) landmarks, world frame, m.
         seen: (N, V) bool.
     """
-    widest = np.zeros(len(points))
-    rays = []
-    for world_from_cam in worlds_from_cams:
-        ray = points - world_from_cam.translation
-        rays.append(ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12))
-    for i in range(len(rays)):
-        for k in range(i):
-            both = seen[:, i] & seen[:, k]
-            cosine = np.einsum("nj,nj->n", rays[i], rays[k])
-            angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-            widest = np.where(both, np.maximum(widest, angle), widest)
-    return widest
+    if len(worlds_from_cams) < 2:
+        return np.zeros(len(points))
+    origins = np.stack([world_from_cam.translation for world_from_cam in worlds_from_cams])
+    return _widest_angles(origins, writable(points), writable(seen))
+
+
+@compiled
+def _widest_angles(origins: Array, points: Array, seen: NDArray[np.bool_]) -> Array:
+    """Return ``ray_angles`` from (V, 3) camera centres."""
+    out = np.zeros(len(points))
+    rays = np.empty((len(origins), 3))
+    for j in range(len(points)):
+        n, least = 0, 1.0
+        for i in range(len(origins)):
+            if not seen[j, i]:
+                continue
+            x, y, z = (
+                points[j, 0] - origins[i, 0],
+                points[j, 1] - origins[i, 1],
+                points[j, 2] - origins[i, 2],
+            )
+            size = max(np.sqrt(x * x + y * y + z * z), 1e-12)
+            rays[n, 0], rays[n, 1], rays[n, 2] = x / size, y / size, z / size
+            for k in range(n):
+                cosine = rays[n, 0] * rays[k, 0] + rays[n, 1] * rays[k, 1] + rays[n, 2] * rays[k, 2]
+                least = min(least, cosine)
+            n += 1
+        out[j] = np.arccos(max(least, -1.0))
+    return out

@@ -30,6 +30,7 @@ from vcl_companion.vision.patches import (
 from vcl_companion.vision.relative_pose import essential_candidates
 from vcl_companion.vision.schur import eliminated
 from vcl_companion.vision.surface_kernels import inclinations
+from vcl_companion.vision.triangulation import ray_angles
 
 
 def warm_up() -> None:
@@ -64,6 +65,7 @@ def _adjust(points: Array) -> None:
     )
     adjust(views, BundleOptions(max_iterations=2))
     point_information(views)
+    ray_angles(list(bodies), points, np.ones((len(points), 2), dtype=np.bool_))
     n = len(points)
     near = np.tile(np.arange(4, dtype=np.int64), (n, 1))
     depth, far = points[:, 2], np.ones((n, 4))
