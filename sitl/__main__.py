@@ -174,7 +174,8 @@ def render(scenario: str, out: Path) -> None:
     metavar="X|max",
     callback=_speed,
     help="Seconds of the recording per second, or max: as fast as all daemons keep up; "
-    "otherwise the paper's pipeline at max, the default one in real time.",
+    "otherwise the paper's pipeline at max, the default one so that each of three drones has "
+    "a processor and a half of this machine, at most in real time.",
 )
 @click.option(
     "--recordings",

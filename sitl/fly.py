@@ -22,6 +22,7 @@ from sitl.report import write_report
 from sitl.result import Event, gather
 from sitl.swarm import Swarm
 from sitl.trajectory_files import write_trajectories
+from vcl_companion.daemon.scheduling import run_among_others, run_before_others
 from vcl_companion.mapping.warm_up import warm_up
 from vcl_companion.recording import read_recording
 
@@ -78,7 +79,7 @@ def fly(recording_path: Path, out: Path, options: FlyOptions, progress: Progress
 async def _flown(plan: FlightPlan, out: Path, progress: Progress) -> Conduct:
     swarm = Swarm(plan, out)
     conduct = Conduct()
-    with _ended_by_sigterm():
+    with _ended_by_sigterm(), _in_time(plan):
         try:
             progress("starting the daemons", 0, 0)
             await swarm.start()
@@ -90,6 +91,19 @@ async def _flown(plan: FlightPlan, out: Path, progress: Progress) -> Conduct:
         finally:
             await swarm.end()
     return conduct
+
+
+@contextmanager
+def _in_time(plan: FlightPlan) -> Iterator[None]:
+    """Cameras wait for no processor: nor does who stands for them in real time, if it may not."""
+    if math.isinf(plan.options.speed):
+        yield
+        return
+    run_before_others()
+    try:
+        yield
+    finally:
+        run_among_others()
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -99,6 +100,8 @@ def stand_in_config(plan: FlightPlan, planned: PlannedDrone, out: Path) -> dict[
         "system_id": planned.system_id,
         "boot_offset_ns": plan.starts_at_ns - booted_before_ns,
         "attitude": attitude,
+        # An autopilot has a processor of its own.
+        "realtime": not math.isinf(plan.options.speed),
         "out": str(out / planned.name),
     }
 

@@ -62,11 +62,14 @@ class Config:
         clock: ``system`` in flight; ``camera`` when a stream or a recording is the time.
         pipeline: ``default`` tracks the map's patches and looks for features only when
             lost; ``paper`` looks for features in every frame.
+        scheduling: ``realtime``: frames of the default pipeline go before everything else
+            on the machine, where it permits that; ``normal``: among others.
     """
 
     system_id: int = 1
     clock: Literal["system", "camera"] = "system"
     pipeline: Pipeline = "default"
+    scheduling: Literal["realtime", "normal"] = "realtime"
     camera: CameraOptions = field(default_factory=CameraOptions)
     autopilot: AutopilotOptions = field(default_factory=AutopilotOptions)
     peers: PeerOptions = field(default_factory=PeerOptions)

@@ -43,6 +43,7 @@ from sitl.autopilots.attitude_source import (
     ReplayedAttitude,
     TruthAttitude,
 )
+from vcl_companion.daemon.scheduling import run_before_others
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.rotation import Array, euler_from_matrix, matrix_from_quaternion
 
@@ -63,12 +64,14 @@ class StandInOptions:
         boot_offset_ns: recording time at the autopilot's start.
         source: where attitudes come from.
         out: directory for what it writes.
+        realtime: whether it goes before other programs on this machine, where that is permitted.
     """
 
     system_id: int
     boot_offset_ns: int
     source: AttitudeSource
     out: Path
+    realtime: bool = False
 
 
 def read_options(path: Path) -> StandInOptions:
@@ -94,7 +97,11 @@ def read_options(path: Path) -> StandInOptions:
         else:
             raise ConfigError(f'{path}: attitude.source must be "truth" or "replay"')
         return StandInOptions(
-            int(config["system_id"]), int(config["boot_offset_ns"]), source, Path(config["out"])
+            int(config["system_id"]),
+            int(config["boot_offset_ns"]),
+            source,
+            Path(config["out"]),
+            bool(config.get("realtime", False)),
         )
     except KeyError as error:
         raise ConfigError(f"{path}: key {error} is missing") from error
@@ -265,6 +272,8 @@ def obey(stand_in: StandIn, command: Mapping[str, object]) -> dict[str, int] | N
 def run(options: StandInOptions) -> None:
     """Serve until told to finish, or until stdin ends."""
     options.out.mkdir(parents=True, exist_ok=True)
+    if options.realtime:
+        run_before_others()
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp,
         (options.out / "attitude.csv").open("w", buffering=1) as attitudes,

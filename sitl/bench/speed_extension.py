@@ -1,4 +1,4 @@
-"""Map extension by three drones beside a tracking load, as a daemon's two threads do it."""
+"""Map extension by three drones beside a tracking load, by a process and a thread as a daemon's."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from sitl.bench.figures import Figure
 from sitl.bench.speed_frames import located
 from sitl.bench.speed_scene import FEATURES, MAPPING, Scene, Shot
 from vcl_companion.daemon.feature_memory import FeatureMemory
+from vcl_companion.daemon.forked import Forked
 from vcl_companion.daemon.map_offer import MapOffer, ReadyMap, ready_map
+from vcl_companion.daemon.scheduling import run_before_others
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.errors import RecordingError
 from vcl_companion.mapping.landmark_map import LandmarkMap
@@ -50,10 +52,10 @@ def extension(scene: Scene, first: LandmarkMap, shots: list[Shot], n_rounds: int
     Raises:
         RecordingError: a round gives no map.
     """
-    vision, mapping = Worker("vision"), Worker("mapping")
-    memory = FeatureMemory(FEATURES)
-    data = encode_map(first)
-    ready = mapping.submit(_ready, data, memory).result()
+    mapping = Forked(_Maker(), {"maps": 8})
+    vision = Worker("vision")
+    vision.submit(run_before_others)
+    ready: ReadyMap = mapping.call("maps", "begin", encode_map(first)).result()
     contributed = [
         [scene.shot(i, _SPACING_S * (k + 1)) for i in range(len(scene.scenario.drone))]
         for k in range(n_rounds)
@@ -63,14 +65,12 @@ def extension(scene: Scene, first: LandmarkMap, shots: list[Shot], n_rounds: int
     rounds: list[_Round] = []
 
     def extend() -> None:
-        current = ready
         for k, seen in enumerate(contributed):
-            result, current = mapping.submit(_round, current, seen, k, memory).result()
-            rounds.append(result)
+            rounds.append(mapping.call("maps", "extend", seen, k).result())
 
     beside_ms = load.during(extend)
-    for worker in (vision, mapping):
-        worker.shutdown()
+    vision.shutdown()
+    mapping.end()
     walls = [r.extend_s for r in rounds]
     last = rounds[-1]
     size = f"{n_rounds} rounds, to {last.n_landmarks} landmarks in {last.n_keyframes} keyframes"
@@ -90,34 +90,41 @@ def extension(scene: Scene, first: LandmarkMap, shots: list[Shot], n_rounds: int
     ]  # fmt: skip
 
 
-def _ready(data: bytes, memory: FeatureMemory) -> ReadyMap:
-    return ready_map(MapOffer.of(BlobKind.MAP, data), None, "akaze", FEATURES, memory, True, {})
+class _Maker:
+    """Extends a map that it keeps."""
 
+    def __init__(self) -> None:
+        self._memory = FeatureMemory(FEATURES)
+        self._current: ReadyMap | None = None
 
-def _round(
-    current: ReadyMap, seen: list[Shot], k: int, memory: FeatureMemory
-) -> tuple[_Round, ReadyMap]:
-    views = [shot.view(k + 1, detected=False) for shot in seen]
-    old = current.index.landmark_map
-    begun_s, cpu_s = time.perf_counter(), time.thread_time()
-    made = extended(
-        old, revision_of(current.data), views, memory.features, MAPPING, pyramid_of=memory.pyramid
-    )
-    extend_s, extend_cpu_s = time.perf_counter() - begun_s, time.thread_time() - cpu_s
-    if isinstance(made, NoMap):
-        raise RecordingError(f"round {k + 1}: the map cannot be extended: {made.reason}")
-    begun_s = time.perf_counter()
-    ready = _ready(encode_map(made), memory)
-    return (
-        _Round(
+    def begin(self, data: bytes) -> ReadyMap:
+        """Make an encoded map ready, and the one to be extended."""
+        offer = MapOffer.of(BlobKind.MAP, data)
+        self._current = ready_map(offer, None, "akaze", FEATURES, self._memory, True, {})
+        return self._current
+
+    def extend(self, seen: list[Shot], k: int) -> _Round:
+        """Extend it by frames, and make what came of it ready."""
+        if self._current is None:
+            raise RuntimeError("there is no map yet")
+        views = [shot.view(k + 1, detected=False) for shot in seen]
+        old, revision = self._current.index.landmark_map, revision_of(self._current.data)
+        begun_s, cpu_s = time.perf_counter(), time.thread_time()
+        made = extended(
+            old, revision, views, self._memory.features, MAPPING, pyramid_of=self._memory.pyramid
+        )
+        extend_s, extend_cpu_s = time.perf_counter() - begun_s, time.thread_time() - cpu_s
+        if isinstance(made, NoMap):
+            raise RecordingError(f"round {k + 1}: the map cannot be extended: {made.reason}")
+        begun_s = time.perf_counter()
+        self.begin(encode_map(made))
+        return _Round(
             extend_s,
             extend_cpu_s,
             time.perf_counter() - begun_s,
             len(made.points_world),
             len(made.keyframes),
-        ),
-        ready,
-    )
+        )
 
 
 class _Load:

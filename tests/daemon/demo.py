@@ -14,11 +14,13 @@ from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_building import Distances, build_map, update_map
 from vcl_companion.daemon.map_store import StoredMap
-from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
+from vcl_companion.localization.intra import LocalizationOptions
 from vcl_companion.localization.map_index import MapIndex, index_map
+from vcl_companion.localization.pipeline import PipelineOptions
+from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.mapping.drone_view import encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.reconstruction import MapOptions
@@ -100,12 +102,19 @@ def known_distances(*system_ids: int) -> Distances:
     return ((system_ids[0], system_ids[1], float(np.linalg.norm(a - b))),)
 
 
-def map_work(swarm: SwarmOptions, sensor: Sensor, inter: InterMavOptions) -> MapWork:
-    """What makes maps for one drone, in threads of this process."""
+def workshop(
+    swarm: SwarmOptions,
+    sensor: Sensor,
+    inter: InterMavOptions,
+    localization: LocalizationOptions | None = None,
+) -> Workshop:
+    """What makes maps for one drone, and searches them."""
+    localization = localization or LocalizationOptions()
+    pipeline = PipelineOptions(FEATURES, localization, TrackingOptions())
     options = WorkOptions(
-        swarm.known_distances, MAP_OPTIONS, FEATURES, ("akaze",), inter, tracked=False
+        swarm.known_distances, MAP_OPTIONS, pipeline, ("akaze",), inter, tracked=False
     )
-    return MapWork(Workshop(sensor, options), forks=False)
+    return Workshop(sensor, options)
 
 
 def answer(system_id: int, k: int = 0, request_id: int = 1) -> FrameAnswer:

@@ -9,15 +9,17 @@ from dataclasses import dataclass
 
 from sitl.frame_server import FrameServer
 from tests.daemon import demo
-from tests.daemon.swarm import Drone
+from tests.daemon.swarm import INTER, Drone
 from tests.daemon.waiting import beside
 from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
+from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.localization.intra import LocalizationOptions
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.tracking import TrackingOptions
+from vcl_companion.swarm.group import SwarmOptions
 
 # More landmarks than any picture has: it cannot localize itself, whatever it sees.
 STARVED = LocalizationOptions(min_inliers=10_000)
@@ -62,6 +64,8 @@ async def flying(
         stack.push_async_callback(server.close)
         camera = StreamCamera("127.0.0.1", port, size_px, drone.clock)
         stack.push_async_callback(camera.close)
+        work = MapWork(demo.workshop(SwarmOptions(), sensor, INTER, localization), forks=False)
+        stack.callback(work.end)
         health = Health(drone.autopilot_link, drone.log)
         companion = Companion(
             camera,
@@ -75,6 +79,7 @@ async def flying(
             health,
             drone.log,
             stack.enter_context(ThreadPoolExecutor(1)),
+            work,
             options,
             frame_wait_s=0.1,
         )

@@ -27,6 +27,7 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.links.autopilot import AutopilotLink
@@ -93,11 +94,11 @@ class Drone:
         swarm = SwarmOptions(members, demo.LEADER, demo.known_distances(1, 2))
         rng = np.random.default_rng(seed)
         self.group = Group(swarm, system_id)
-        self.work = demo.map_work(swarm, demo.sensor(system_id), inter)
+        self.work = MapWork(demo.workshop(swarm, demo.sensor(system_id), inter), forks=False)
         self.exchange = Exchange(
             system_id, self.group, Transfers(transfer, rng), self.maps,
             self.autopilot_link, demo.sensor(system_id), clock, self.log, self.work,
-            executor, executor, self.estimator,
+            executor, self.estimator,
             ExchangeOptions(swarm, demo.MAP_OPTIONS, update, ("akaze",), inter, tracked=False),
             rng,
         )  # fmt: skip
@@ -183,7 +184,7 @@ class Flyer(Drone):
             companion = Companion(
                 source, FrameOutcomes(source, self.clock, health, self.log), sensor,
                 self.autopilot_link, self.maps, self.estimator, self.exchange.inter,
-                self.exchange.on_frame, health, self.log, executor,
+                self.exchange.on_frame, health, self.log, executor, self.work,
                 PipelineOptions(demo.FEATURES, LocalizationOptions(), TrackingOptions()),
                 frame_wait_s=0.1,
             )  # fmt: skip

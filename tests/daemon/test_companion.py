@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +30,11 @@ from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.inter_target import InterTarget
 from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.geometry.rotation import matrix_from_euler, quaternion_from_matrix
 from vcl_companion.links.autopilot import AutopilotLink
-from vcl_companion.localization.intra import LocalizationOptions
+from vcl_companion.localization.intra import LocalizationOptions, Localized, NotLocalized
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.localization.tracking import TrackingOptions
@@ -57,7 +60,7 @@ class Flight:
     history: FrameHistory
     log: FlightLog
     path: Path
-    executor: ThreadPoolExecutor
+    shop: Shop
 
     def give(self, k: int, sequence: int | None = None, north_turned_rad: float = 0.0) -> None:
         """Hand out the k-th picture, and its attitude before it."""
@@ -104,11 +107,27 @@ class Flight:
         return [line["by"] for line in self.lines()]
 
 
-def nobody_to_ask(executor: ThreadPoolExecutor, clock: ManualClock) -> InterTarget:
+class Shop(Workshop):
+    """Searches when it is let."""
+
+    def __init__(self) -> None:
+        options = WorkOptions(
+            (), demo.MAP_OPTIONS, OPTIONS, ("akaze",), InterMavOptions(detector="akaze"), True
+        )
+        super().__init__(demo.sensor(DRONE), options)
+        self.is_open = threading.Event()
+        self.is_open.set()
+
+    def find(self, *asked: Any) -> Localized | NotLocalized:
+        assert self.is_open.wait(10.0)
+        return super().find(*asked)
+
+
+def nobody_to_ask(work: MapWork, clock: ManualClock) -> InterTarget:
     """The target's side of inter-MAV localization of a drone alone."""
     alone = HostChoice(Group(SwarmOptions(), DRONE))
     return InterTarget(
-        DRONE, alone, demo.sensor(DRONE), clock, executor, lambda _, __: 0, lambda _: None,
+        DRONE, alone, demo.sensor(DRONE), clock, work, lambda _, __: 0, lambda _: None,
         InterMavOptions(), np.random.default_rng(0), only_the_surer=True,
     )  # fmt: skip
 
@@ -133,14 +152,17 @@ async def flight(
         )
         log = stack.enter_context(contextlib.closing(FlightLog(str(path / "log"), clock)))
         executor = stack.enter_context(ThreadPoolExecutor(1))
+        shop = Shop()
+        work = MapWork(shop, forks=False)
+        stack.callback(work.end)
         maps, history = MapStore(""), FrameHistory()
         health = Health(link, log)
         outcomes = FrameOutcomes(camera, clock, health, log)
         motion = FilterOptions(coast_s=coast_s)
         estimator = Estimator(motion, OPTIONS.localization, lambda _: None)
         companion = Companion(
-            camera, outcomes, sensor, link, maps, estimator, nobody_to_ask(executor, clock),
-            history.add, health, log, executor, OPTIONS, frame_wait_s,
+            camera, outcomes, sensor, link, maps, estimator, nobody_to_ask(work, clock),
+            history.add, health, log, executor, work, OPTIONS, frame_wait_s,
         )  # fmt: skip
         await stack.enter_async_context(beside(link.run()))
         assert await link.attitude_at(first.at_ns, 5.0) is not None
@@ -156,7 +178,7 @@ async def flight(
             history,
             log,
             path / "log",
-            executor,
+            shop,
         )
 
 
@@ -285,12 +307,14 @@ def test_frames_faster_than_they_can_be_localized_are_dropped_and_counted(tmp_pa
     async def scenario() -> None:
         async with flying(tmp_path) as up:
             up.fly_on_a_map()
-            for k in range(8):
+            up.give(0)
+            await up.server.answered()
+            for k in range(1, 8):
                 up.give(k)
             await up.server.answered()
             counts = Counter(up.server.outcomes.values())
             assert sum(counts.values()) == 8
-            assert 1 <= counts["localized"] <= 7
+            assert 2 <= counts["localized"] <= 7
             assert counts["dropped"] == 8 - counts["localized"]
             assert up.server.outcomes[7] == "localized"  # fresh beats complete
             assert up.log.frames == {"refused": 0, **counts}
@@ -343,24 +367,42 @@ def test_a_newer_frame_ends_the_wait_for_the_next_map(tmp_path: Path) -> None:
     run(scenario())
 
 
-def test_a_search_in_vain_that_kept_a_frame_waiting_leaves_time_for_others(tmp_path: Path) -> None:
+def test_a_frame_that_is_looked_for_keeps_none_waiting_and_counts_when_found(
+    tmp_path: Path,
+) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            up.shop.is_open.clear()
+            for k, shot in enumerate(demo.shot(DRONE, k) for k in range(3)):
+                up.give(k)
+                await until(partial(up.estimator.has_looked_at, shot.at_ns))
+            await until(lambda: 1 in up.server.outcomes)
+            assert up.frames() == [(1, "refused", "lost, and not looked for again yet")]
+            # It leads the newest of those that followed it.
+            up.shop.is_open.set()
+            await up.server.answered()
+            assert sorted(up.frames()[1:]) == [(0, "localized", None), (2, "localized", None)]
+
+    run(scenario())
+
+
+def test_a_search_in_vain_that_others_overtook_leaves_time_for_them(tmp_path: Path) -> None:
     async def scenario() -> None:
         async with flying(tmp_path) as up:
             up.fly_on_nothing_known(tracked=True)
-            busy = threading.Event()
-            up.executor.submit(busy.wait)
+            up.shop.is_open.clear()
             up.give(0)
-            await until(lambda: up.history.newest is not None)
+            await until(lambda: up.estimator.has_looked_at(demo.shot(DRONE, 0).at_ns))
             up.give(1)
-            # It waits now, and will when the search for the first one is over.
-            await until(lambda: up.history.newest is not None and up.history.newest.sequence == 1)
-            busy.set()
+            await until(lambda: up.estimator.has_looked_at(demo.shot(DRONE, 1).at_ns))
+            await asyncio.sleep(0.3)  # so long it takes, and so long is not looked again
+            up.shop.is_open.set()
             await up.server.answered()
-            (_, _, searched), (_, outcome, paused) = up.frames()
-            assert outcome == "refused"
-            assert paused == "lost, and looked for in vain a moment ago"
-            assert searched
-            assert searched != paused
+            reasons = {sequence: reason for sequence, _, reason in up.frames()}
+            assert reasons[1] == "lost, and not looked for again yet"
+            assert reasons[0]
+            assert reasons[0] != reasons[1]
             # Another map is searched at once.
             up.fly_on_a_map()
             up.give(2)

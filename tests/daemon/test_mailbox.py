@@ -30,12 +30,6 @@ def test_the_newest_wins_and_the_replaced_one_comes_back() -> None:
 def test_who_comes_first_waits_for_the_frame() -> None:
     async def scenario() -> None:
         mailbox, coming = Mailbox(), frame(0)
-        watcher = asyncio.create_task(mailbox.filled())
-        await asyncio.sleep(0)
-        assert not watcher.done()
-        mailbox.put(coming)
-        await watcher
-        assert await mailbox.take() is coming
         taker = asyncio.create_task(mailbox.take())
         await asyncio.sleep(0)
         assert not taker.done()
@@ -45,17 +39,24 @@ def test_who_comes_first_waits_for_the_frame() -> None:
     run(scenario())
 
 
-def test_filled_leaves_the_frame_and_waits_again_once_it_is_taken() -> None:
+def test_who_has_a_frame_is_told_of_a_newer_one_taken_or_not() -> None:
     async def scenario() -> None:
-        mailbox = Mailbox()
-        mailbox.put(frame(0))
-        await mailbox.filled()
-        await mailbox.filled()
-        assert (await mailbox.take()).sequence == 0
-        again = asyncio.create_task(mailbox.filled())
+        mailbox, frames = Mailbox(), [frame(k) for k in range(3)]
+        mailbox.put(frames[0])
+        assert await mailbox.take() is frames[0]
+        watchers = [asyncio.create_task(mailbox.newer_than(frames[0])) for _ in range(2)]
+        taker = asyncio.create_task(mailbox.take())
         await asyncio.sleep(0)
-        assert not again.done()
-        again.cancel()
+        assert not mailbox.has_had_newer(frames[0])
+        assert not any(watcher.done() for watcher in watchers)
+        mailbox.put(frames[1])
+        assert await taker is frames[1]
+        await asyncio.gather(*watchers)
+        await mailbox.newer_than(frames[0])
+        assert mailbox.has_had_newer(frames[0])
+        assert not mailbox.has_had_newer(frames[1])
+        mailbox.put(frames[2])
+        await mailbox.newer_than(frames[1])
 
     run(scenario())
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,9 @@ from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.errors import WireError
+from vcl_companion.localization.intra import LocalizationOptions, Localized
+from vcl_companion.localization.pipeline import ALL_EFFORT, PipelineOptions
+from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.wire.header import BlobKind
@@ -34,8 +38,9 @@ class Workplace(Workshop):
 
 
 def workplace() -> Workplace:
+    pipeline = PipelineOptions(demo.FEATURES, LocalizationOptions(), TrackingOptions())
     options = WorkOptions(
-        demo.known_distances(1, 2), demo.MAP_OPTIONS, demo.FEATURES, ("akaze", "orb"),
+        demo.known_distances(1, 2), demo.MAP_OPTIONS, pipeline, ("akaze", "orb"),
         InterMavOptions(detector="akaze"), tracked=True,
     )  # fmt: skip
     return Workplace(demo.sensor(1), options)
@@ -76,6 +81,19 @@ def test_a_map_that_it_has_not_seen_is_handed_over_and_extended(work: MapWork) -
         assert built.parent == revision_of(PAIR)
         handed = await work.encoded(built, pair())
         assert 0 < len(handed.update) < len(handed.data)
+
+    run(check())
+
+
+def test_a_frame_is_found_in_a_map_that_was_made_there_or_not(work: MapWork) -> None:
+    async def check() -> None:
+        shot = demo.shot(2)
+        ready = await work.ready(MapOffer.of(BlobKind.MAP, PAIR), None, {})
+        for stored in (ready.stored(), replace(pair(), revision=b"another")):
+            fix = await work.find(shot.image, stored, None, shot.ned_from_body.rotation, ALL_EFFORT)
+            assert isinstance(fix, Localized)
+            off = demo.world_from_body(2, 0).local(fix.world_from_body)
+            assert np.linalg.norm(off[:3]) < 0.2
 
     run(check())
 

@@ -12,6 +12,7 @@ from tests.daemon import demo
 from tests.daemon.swarm import INTER, swarm
 from tests.daemon.waiting import computed, passes_until, run
 from tests.wire.samples import small_frame
+from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.errors import WireError
 from vcl_companion.swarm.group import Group, SwarmOptions
@@ -36,7 +37,9 @@ class Member:
         self.cancelled: list[int] = []
         self.frames = PassedFrames(
             group, self._hand, self.cancelled.append,
-            demo.map_work(SwarmOptions((1, 2, 3)), demo.sensor(own_id), INTER),
+            MapWork(
+                demo.workshop(SwarmOptions((1, 2, 3)), demo.sensor(own_id), INTER), forks=False
+            ),
         )  # fmt: skip
 
     def _hand(self, peer: int, blob: bytes) -> int:

@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 
-from vcl_companion.daemon.usage import _unchanged_file_pages, cpu_s, peak_resident_mb
+from vcl_companion.daemon.usage import _unchanged_file_pages, cpu_s, forget_peak, peak_resident_mb
 
 _TELL = "from vcl_companion.daemon.usage import peak_resident_mb as p; print(p())"
 
@@ -37,6 +37,14 @@ def test_a_small_process_of_a_large_one_tells_its_own_memory() -> None:
     told = subprocess.run([sys.executable, "-c", _TELL], capture_output=True, check=True)
     assert large.nbytes / 2**20 < ours < 20_000.0
     assert 5.0 < float(told.stdout) < 100.0
+
+
+def test_a_peak_that_is_forgotten_is_not_told_again() -> None:
+    large = np.ones(200 * 2**17)  # 200 MiB
+    before_mb = peak_resident_mb()
+    del large
+    forget_peak()
+    assert peak_resident_mb() < before_mb - 150.0
 
 
 def test_working_costs_processor_time_and_waiting_none() -> None:

@@ -116,7 +116,7 @@ def test_without_time_for_a_search_patches_are_followed_and_nothing_is_looked_fo
         if expected is not None:
             found(fix, "patches")
         else:
-            assert fix == NotLocalized("lost, and looked for in vain a moment ago")
+            assert fix == NotLocalized("lost, and not looked for again yet")
 
 
 def test_the_paper_s_pipeline_finds_features_only() -> None:

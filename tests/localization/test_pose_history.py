@@ -8,7 +8,7 @@ import pytest
 from tests.checks import assert_pose_close
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, matrix_from_euler
-from vcl_companion.localization.intra import Localized
+from vcl_companion.localization.intra import Localized, NotLocalized
 from vcl_companion.localization.pose_filter import (
     FilterOptions,
     FilterState,
@@ -92,6 +92,49 @@ def test_a_late_proposal_is_worth_as_much_as_one_in_time() -> None:
         fused.world_from_body, newest(in_time).world_from_body, within_m=1e-12, within_rad=1e-12
     )
     np.testing.assert_allclose(fused.covariance, newest(in_time).covariance, atol=1e-12)
+
+
+def test_a_late_fix_is_worth_as_much_as_one_in_time() -> None:
+    """Of a frame that was looked for by its features while others were tracked."""
+    in_time, fixes = flown(np.random.default_rng(3), 8)
+    late = PoseHistory(5.0, OPTIONS)
+    for k, fix in enumerate(fixes):
+        if k == 3:
+            predicted = predict(newest(late), k * FRAME_NS, truth_at(k).rotation, OPTIONS)
+            assert predicted is not None
+            late.append(predicted, None, truth_at(k).rotation)
+            continue
+        advance(late, k, fix)
+    state = late.refit(3 * FRAME_NS, fixes[3])
+    assert isinstance(state, FilterState)
+    assert late.own_fix_at(3 * FRAME_NS) is state
+    assert state.at_ns == 3 * FRAME_NS
+    one, other = newest(late), newest(in_time)
+    assert_pose_close(one.world_from_body, other.world_from_body, within_m=1e-12, within_rad=1e-12)
+    np.testing.assert_allclose(one.covariance, other.covariance, atol=1e-12)
+
+
+def test_a_late_fix_of_what_is_not_kept_or_was_found_or_cannot_be_is_refused() -> None:
+    history, fixes = flown(np.random.default_rng(4), 4)
+    before = newest(history)
+    for at_ns, fix in ((2 * FRAME_NS, fixes[2]), (FRAME_NS // 2, fixes[0])):
+        assert isinstance(history.refit(at_ns, fix), NotLocalized)
+    predicted = predict(before, 4 * FRAME_NS, truth_at(4).rotation, OPTIONS)
+    assert predicted is not None
+    history.append(predicted, None, truth_at(4).rotation)
+    turned = Pose(truth_at(4).rotation @ matrix_from_euler(0.0, 0.0, 1.0), np.zeros(3))
+    assert isinstance(history.refit(4 * FRAME_NS, fix_at(turned)), NotLocalized)
+    assert newest(history) is predicted
+
+
+def test_the_last_frame_looked_at_again_takes_its_own_place() -> None:
+    history, _ = flown(np.random.default_rng(5), 3)
+    predicted = predict(newest(history), 3 * FRAME_NS, truth_at(3).rotation, OPTIONS)
+    assert predicted is not None
+    history.append(predicted, None, truth_at(3).rotation)
+    assert history.own_fix_at(3 * FRAME_NS) is None
+    advance(history, 3, fix_at(truth_at(3)))
+    assert history.own_fix_at(3 * FRAME_NS) is newest(history)
 
 
 def test_a_starved_drone_takes_what_the_peer_knows() -> None:

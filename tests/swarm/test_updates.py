@@ -15,7 +15,8 @@ from vcl_companion.swarm.updates import OwnVote, Sight, UpdateOptions, UpdateTri
 from vcl_companion.wire.messages import MapState
 from vcl_companion.wire.tunnel import decode_payload, encode_payload
 
-OPTIONS = UpdateOptions()
+# Long against a step of these tests.
+OPTIONS = UpdateOptions(hold_s=0.5, interval_s=1.0)
 STEP_S = 0.1
 FIRST, SECOND = b"revision", b"the next"
 PLENTY, FEW = 400, 20

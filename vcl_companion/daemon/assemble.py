@@ -9,6 +9,7 @@ import signal
 import sys
 import time
 from collections.abc import Coroutine
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -28,8 +29,10 @@ from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.scheduling import run_before_others
 from vcl_companion.daemon.usage import (
     cpu_s,
+    forget_peak,
     give_back_files,
     give_back_freed,
     peak_resident_mb,
@@ -51,8 +54,7 @@ _log = logging.getLogger(__name__)
 # A device that does not let go must not keep the flight log from its summary.
 _CLOSE_S = 3.0
 _SWITCH_S = 0.0005
-# Niceness of encoding frames for peers above localizing them.
-_ENCODING_YIELDS = 4
+_N_READERS = 4
 _END_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
@@ -121,27 +123,41 @@ async def _run(config: Config) -> int:
     # a tenth of a second and the interpreter's lock.
     gc.collect()
     gc.freeze()
+    began_mb = peak_resident_mb()
     give_back_freed()
     give_back_files()
+    forget_peak()
     tracked = config.pipeline == "default"
+    # The paper's pipeline would leave nothing to others: a frame takes longer than it may.
+    realtime = tracked and config.scheduling == "realtime"
+    pipeline = PipelineOptions(config.features, config.localization, config.tracking)
     building = replace(config.map, patches=config.map.patches and tracked)
-    # Frames never wait for a map that is being built: that is another process, begun while
-    # there are no threads at work that it would not have.
+    # Frames never wait for a map that is being built, nor for one that is looked for all over
+    # it: that is another process, begun while no threads are at work that it would not have.
     work = MapWork(
         Workshop(
             sensor,
             WorkOptions(
                 config.swarm.known_distances,
                 building,
-                config.features,
+                pipeline,
                 config.recognised_by(),
                 config.inter,
                 tracked,
             ),
         ),
         forks=True,
+        realtime=realtime,
     )
-    encoding, disk = Worker("encoding", _ENCODING_YIELDS), Worker("disk")
+    if realtime:
+        vision.submit(run_before_others)
+        # Cameras are read, and their images decoded, by threads of the loop's.
+        loop.set_default_executor(
+            ThreadPoolExecutor(_N_READERS, "camera", initializer=run_before_others)
+        )
+        if not run_before_others():
+            _log.info("frames wait for other programs: no real-time scheduling for this user")
+    disk = Worker("disk")
     rng = np.random.default_rng()
     exchange = Exchange(
         config.system_id,
@@ -153,7 +169,6 @@ async def _run(config: Config) -> int:
         clock,
         log,
         work,
-        encoding,
         disk,
         estimator,
         ExchangeOptions(
@@ -178,7 +193,8 @@ async def _run(config: Config) -> int:
         health,
         log,
         vision,
-        PipelineOptions(config.features, config.localization, config.tracking),
+        work,
+        pipeline,
         config.update.frame_wait_s,
     )
     peers = PeerLink(
@@ -208,17 +224,17 @@ async def _run(config: Config) -> int:
                     await camera.close()
         finally:
             # What still runs is not waited for: an update takes seconds, and nobody wants it.
-            for worker in (vision, encoding, disk):
+            for worker in (vision, disk):
                 worker.shutdown(wait=False, cancel_futures=True)
             taken = work.end()
             log.close(
                 cpu_s=cpu_s() - began_cpu_s + taken.cpu_s,
                 wall_s=time.monotonic() - began_at_s,
-                resident_mb=peak_resident_mb() + taken.peak_mb,
+                resident_mb=max(began_mb, peak_resident_mb() + taken.peak_mb),
                 peer_bytes_sent=peers.counters.bytes_out,
                 peer_bytes_received=peers.counters.bytes_in,
             )
-    for worker in (vision, encoding, disk):
+    for worker in (vision, disk):
         worker.exit_status = 0
     work.ends_with(0)
     return 0

@@ -9,6 +9,8 @@ from collections.abc import Callable, Coroutine
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
+import numpy as np
+
 from vcl_companion.cameras.source import CameraSource, Frame
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import Basis, FlightLog, PoseSource
@@ -17,6 +19,7 @@ from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.inter_target import Asked, InterTarget
 from vcl_companion.daemon.mailbox import Mailbox
 from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.localization.intra import Localized, NotLocalized
@@ -37,7 +40,24 @@ _DOUBT_EVERY_S = 5.0
 _FALL_BACK_EVERY_S = 1.0
 # A search in vain that took longer than frames are apart is not begun again before so many
 # times as long: on a small board the map that it needs would else never be made.
-_PAUSE_AFTER_VAIN = 3.0
+_PAUSE_AFTER_VAIN = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Sought:
+    """A frame that features are asked about, because patches gave no pose.
+
+    Attributes:
+        frame: which.
+        ned_from_body: (3, 3) its attitude, or None.
+        stored: the map that is searched.
+        may_fall_back: whether by all detectors.
+    """
+
+    frame: Frame
+    ned_from_body: Array | None
+    stored: StoredMap
+    may_fall_back: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +78,9 @@ class _AskedPeers:
 class Companion:
     """Takes the newest frame, localizes it, sends the pose; one frame at a time.
 
+    A frame that has to be looked for by its features takes as long as ten others: it is, and
+    is answered, beside those that follow it.
+
     Args:
         camera: where frames come from.
         outcomes: where each is answered.
@@ -70,6 +93,7 @@ class Companion:
         health: told while a frame waits for a map.
         log: told of every estimate.
         executor: runs the vision, beside the event loop.
+        work: searches the map for a frame that patches do not place, beside both.
         options: of the steps.
         frame_wait_s: how long a frame that the map does not know waits for the next
             map, which it may have gone into itself, while no newer frame comes.
@@ -88,6 +112,7 @@ class Companion:
         health: Health,
         log: FlightLog,
         executor: Executor,
+        work: MapWork,
         options: PipelineOptions,
         frame_wait_s: float,
     ) -> None:
@@ -102,6 +127,7 @@ class Companion:
         self._health = health
         self._log = log
         self._executor = executor
+        self._work = work
         self._options = options
         self._frame_wait_s = frame_wait_s
         self._mailbox = Mailbox()
@@ -110,6 +136,8 @@ class Companion:
         self._sent_at_ns = -1
         self._doubted_at_s = self._fell_back_at_s = self._search_again_at_s = -math.inf
         self._searched: StoredMap | None = None
+        self._search_over = asyncio.Event()
+        self._search_over.set()
 
     async def read_camera(self) -> None:
         """Move frames from the camera to the mailbox until the stream ends and all are answered.
@@ -129,25 +157,25 @@ class Companion:
 
     async def run(self) -> None:
         """Localize frames until cancelled."""
-        async with asyncio.TaskGroup() as asking:
+        async with asyncio.TaskGroup() as beside:
             while True:
                 frame = await self._mailbox.take()
                 stored = self._maps.current or await self._first_map(frame)
                 if stored is None:
                     continue
-                asked = await self._localize(frame, stored)
-                if asked is not None:
-                    asking.create_task(self._hear_peers(asked))
+                left = await self._localize(frame, stored)
+                if left is not None:
+                    beside.create_task(self._finish(left))
 
     async def _first_map(self, frame: Frame) -> StoredMap | None:
         """Wait for a first map as long as no newer frame comes; answer the frame if none does."""
         with self._health.waiting_for_map():
-            await self._unless_newer(self._maps.decided())
+            await self._unless_newer(frame, self._maps.decided())
         if self._maps.current is None:
             self._outcomes.refuse(frame, self._no_map())
         return self._maps.current
 
-    async def _next_map(self, stored: StoredMap) -> StoredMap | None:
+    async def _next_map(self, frame: Frame, stored: StoredMap) -> StoredMap | None:
         """Wait for a map that may know a place which this one does not, while no frame comes.
 
         A frame that is not recognised shows where the map has a gap, and is among those that
@@ -155,18 +183,21 @@ class Companion:
         """
         if stored is not self._vain and self._maps.current is stored:
             with self._health.waiting_for_map():
-                await self._unless_newer(self._maps.newer_than(stored), self._frame_wait_s)
-            if self._maps.current is stored and not self._mailbox.is_filled:
+                await self._unless_newer(frame, self._maps.newer_than(stored), self._frame_wait_s)
+            if self._maps.current is stored and not self._mailbox.has_had_newer(frame):
                 self._vain = stored
         return None if self._maps.current is stored else self._maps.current
 
     async def _unless_newer(
-        self, awaited: Coroutine[None, None, object], within_s: float | None = None
+        self,
+        frame: Frame,
+        awaited: Coroutine[None, None, object],
+        within_s: float | None = None,
     ) -> None:
         """Wait for something, until a newer frame comes or the stream is over."""
         waiting = [
             asyncio.ensure_future(one)
-            for one in (awaited, self._mailbox.filled(), self._over.wait())
+            for one in (awaited, self._mailbox.newer_than(frame), self._over.wait())
         ]
         try:
             await asyncio.wait(waiting, timeout=within_s, return_when=asyncio.FIRST_COMPLETED)
@@ -178,8 +209,8 @@ class Companion:
         ended = "the camera's stream is over" if self._over.is_set() else "none yet"
         return NotLocalized(f"no map: {self._maps.refusal or ended}")
 
-    async def _localize(self, frame: Frame, stored: StoredMap) -> _AskedPeers | None:
-        """Localize a frame by the map, and answer it unless peers are asked about it as well.
+    async def _localize(self, frame: Frame, stored: StoredMap) -> _Sought | _AskedPeers | None:
+        """Localize a frame by the map, and answer it unless features or peers are asked as well.
 
         Returns:
             What they are asked; None when nobody is and the frame is answered.
@@ -187,10 +218,11 @@ class Companion:
         at_ns = frame.captured_at_ns
         attitude = await self._autopilot.attitude_at(at_ns, ATTITUDE_WAIT_S)
         ned_from_body = None if attitude is None else attitude.ned_from_body
-        predicted = self._estimator.predicted(at_ns, ned_from_body)
         now_s = asyncio.get_running_loop().time()
-        may_fall_back = now_s >= self._fell_back_at_s + _FALL_BACK_EVERY_S
-        may_search = stored is not self._searched or now_s >= self._search_again_at_s
+        follows = stored.templates is not None
+        may_doubt = now_s >= self._doubted_at_s + _DOUBT_EVERY_S
+        effort = Effort(may_search=not follows, may_doubt=may_doubt)
+        predicted = self._estimator.predicted(at_ns, ned_from_body)
         fix = await asyncio.get_running_loop().run_in_executor(
             self._executor,
             localize,
@@ -202,20 +234,57 @@ class Companion:
             predicted.prior() if predicted else None,
             ned_from_body,
             self._options,
-            Effort(
-                may_search=may_search,
-                may_doubt=now_s >= self._doubted_at_s + _DOUBT_EVERY_S,
-                may_fall_back=may_fall_back,
-            ),
+            effort,
         )
         if isinstance(fix, Localized) and is_doubtful(fix):
             self._doubted_at_s = now_s
-        if isinstance(fix, NotLocalized) and may_search:
-            self._searched_in_vain(stored, now_s)
-            if may_fall_back and stored.index.fallback is not None:
-                self._fell_back_at_s = now_s
         refused = self._take(frame, fix, ned_from_body)
         self._estimator.seen_on = stored.revision
+        if isinstance(fix, NotLocalized) and follows:
+            if self._is_searching:
+                # What is found there leads this frame too, if it is still the newest then.
+                await self._unless_newer(frame, self._search_over.wait())
+                if not (self._is_searching or self._mailbox.has_had_newer(frame)):
+                    return await self._localize(frame, self._maps.current or stored)
+            elif stored is not self._searched or now_s >= self._search_again_at_s:
+                self._search_over.clear()
+                may_fall_back = now_s >= self._fell_back_at_s + _FALL_BACK_EVERY_S
+                return _Sought(frame, ned_from_body, stored, may_fall_back)
+        return await self._ask(frame, ned_from_body, stored, refused)
+
+    @property
+    def _is_searching(self) -> bool:
+        return not self._search_over.is_set()
+
+    async def _search(self, sought: _Sought) -> _AskedPeers | _Sought | None:
+        """Look for a frame by its features; the rest is as for any other."""
+        frame, stored = sought.frame, sought.stored
+        began_s = asyncio.get_running_loop().time()
+        effort = Effort(may_track=False, may_fall_back=sought.may_fall_back)
+        predicted = self._estimator.predicted(frame.captured_at_ns, sought.ned_from_body)
+        prior = predicted.prior() if predicted else None
+        try:
+            fix = await self._work.find(
+                np.asarray(frame.image), stored, prior, sought.ned_from_body, effort
+            )
+        finally:
+            self._search_over.set()
+        if isinstance(fix, NotLocalized):
+            self._searched_in_vain(frame, stored, began_s)
+            if sought.may_fall_back and stored.index.fallback is not None:
+                self._fell_back_at_s = began_s
+        refused = self._take(frame, fix, sought.ned_from_body)
+        self._estimator.seen_on = stored.revision
+        return await self._ask(frame, sought.ned_from_body, stored, refused)
+
+    async def _ask(
+        self,
+        frame: Frame,
+        ned_from_body: Array | None,
+        stored: StoredMap,
+        refused: NotLocalized | None,
+    ) -> _Sought | _AskedPeers | None:
+        """Answer a frame that has been looked at, unless peers are asked about it."""
         sigma_m = math.inf if refused else self._estimator.sigma_m
         asked = self._inter.begin(frame, ned_from_body, stored.revision, sigma_m)
         if asked is not None:
@@ -225,20 +294,20 @@ class Companion:
             return None
         return await self._given_up(frame, stored, refused)
 
-    def _searched_in_vain(self, stored: StoredMap, began_at_s: float) -> None:
-        """Note a search that found nothing, and whether it kept the next frame waiting."""
+    def _searched_in_vain(self, frame: Frame, stored: StoredMap, began_at_s: float) -> None:
+        """Note a search that found nothing, and whether it took longer than frames are apart."""
         ended_at_s = asyncio.get_running_loop().time()
         self._searched = stored
         self._maps.want_more()
-        if self._mailbox.is_filled:
+        if self._mailbox.has_had_newer(frame):
             self._search_again_at_s = ended_at_s + _PAUSE_AFTER_VAIN * (ended_at_s - began_at_s)
 
     async def _given_up(
         self, frame: Frame, stored: StoredMap, refused: NotLocalized
-    ) -> _AskedPeers | None:
+    ) -> _Sought | _AskedPeers | None:
         """Answer a frame that nobody could place, unless a newer map comes that may place it."""
         self._health.refused(refused.reason)
-        newer = await self._next_map(stored)
+        newer = await self._next_map(frame, stored)
         if newer is not None:
             return await self._localize(frame, newer)
         self._give_up(frame, refused)
@@ -267,6 +336,13 @@ class Companion:
             return state
         return self._send(frame, state, "intra", fix.by, fix.n_matched, fix.n_inliers)
 
+    async def _finish(self, left: _Sought | _AskedPeers | None) -> None:
+        """Do what is left to do for a frame, beside the frames that follow it."""
+        while isinstance(left, _Sought):
+            left = await self._search(left)
+        if left is not None:
+            await self._hear_peers(left)
+
     async def _hear_peers(self, open_frame: _AskedPeers) -> None:
         """Fuse what peers say of a frame, answer it, and fuse what comes too late for that."""
         asked, stored, refused = open_frame.asked, open_frame.stored, open_frame.refused
@@ -283,8 +359,7 @@ class Companion:
                 self._outcomes.close(asked.frame)
             else:
                 self._outcomes.refuse(asked.frame, unsent)
-        if again is not None:
-            await self._hear_peers(again)
+        await self._finish(again)
         for host, proposal in await self._inter.stragglers(asked):
             self._fuse(host, proposal, asked, stored)
 

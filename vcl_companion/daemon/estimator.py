@@ -88,16 +88,25 @@ class Estimator:
         """Return what was believed at a frame that had a fix of its own; None at any other."""
         return self._history.own_fix_at(at_ns)
 
+    def has_looked_at(self, at_ns: int) -> bool:
+        """Whether the frame of an instant, or a later one, has been looked at."""
+        return self._looked_at_ns >= at_ns
+
     async def looked_at(self, at_ns: int, within_s: float) -> None:
         """Wait until the frame of an instant has been looked at, or the time is over."""
         with suppress(TimeoutError):
             async with asyncio.timeout(within_s):
-                while self._looked_at_ns < at_ns:
+                while not self.has_looked_at(at_ns):
                     self._looked.clear()
                     await self._looked.wait()
 
     def predicted(self, at_ns: int, ned_from_body: Array | None) -> FilterState | None:
-        """Return the state carried to a frame's instant; None when there is none, or too old."""
+        """Return the state carried to a frame's instant; None when there is none, or too old.
+
+        For a frame older than the newest one it is what is believed of that instant.
+        """
+        if self._is_late(at_ns):
+            return self._history.at(at_ns)
         newest = self._history.newest
         state = None if newest is None else predict(newest, at_ns, ned_from_body, self._options)
         if state is None:
@@ -107,7 +116,9 @@ class Estimator:
     def take_nothing(
         self, predicted: FilterState | None, at_ns: int, ned_from_body: Array | None
     ) -> None:
-        """Note a frame without a fix: a proposal may still come for its instant."""
+        """Note a frame without a fix: one may still come for its instant, or a proposal."""
+        if self._is_late(at_ns):
+            return
         self.tracked, self.covered, self.novelty_deg = 0, 0.0, 0.0
         if predicted is not None:
             self._history.append(predicted, None, ned_from_body)
@@ -136,10 +147,15 @@ class Estimator:
     ) -> FilterState | NotLocalized:
         """Bring the state up to a frame's fix.
 
+        One that comes late is taken in at its own time, and what has been measured since
+        is applied again.
+
         Returns:
             The state after the frame, or why the fix is not believed; the frame
             then counts as one without.
         """
+        if self._is_late(at_ns):
+            return self._take_late(fix, at_ns)
         state = started(fix, at_ns, ned_from_body, self._options)
         if predicted is not None:
             updated = update(predicted, fix)
@@ -164,6 +180,15 @@ class Estimator:
         self.novelty_deg = fix.novelty_deg
         self._history.append(state, fix, ned_from_body)
         self._note(at_ns)
+        return state
+
+    def _take_late(self, fix: Localized, at_ns: int) -> FilterState | NotLocalized:
+        before = self._history.at(at_ns)
+        state = self._history.refit(at_ns, fix)
+        if isinstance(state, FilterState):
+            if before is not None and state.n_jumps > before.n_jumps:
+                self._jump(f"relocalized with {fix.n_inliers} landmarks")
+            self._n_contradicted = 0
         return state
 
     def take_proposal(
@@ -205,6 +230,11 @@ class Estimator:
         if isinstance(fused, NotFused):
             return fused
         return self._history.at(at_ns) or fused
+
+    def _is_late(self, at_ns: int) -> bool:
+        """Whether a later frame has been taken in already."""
+        newest = self._history.newest
+        return newest is not None and at_ns < newest.at_ns
 
     def _note(self, at_ns: int) -> None:
         self._looked_at_ns = at_ns

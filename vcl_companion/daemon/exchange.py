@@ -86,8 +86,7 @@ class Exchange:
         sensor: of our camera.
         clock: time base of frames.
         log: told of maps and peers.
-        work: makes maps, and looks for peers' poses.
-        encoding: encodes our frames for peers.
+        work: makes maps, encodes our frames, and looks for peers' poses.
         disk: writes maps.
         estimator: where this drone is, and whether it knows.
         options: of the steps.
@@ -105,7 +104,6 @@ class Exchange:
         clock: Clock,
         log: FlightLog,
         work: MapWork,
-        encoding: Executor,
         disk: Executor,
         estimator: Estimator,
         options: ExchangeOptions,
@@ -136,7 +134,7 @@ class Exchange:
             sensor,
             clock,
             log,
-            encoding,
+            work,
             partial(self._hand, BlobKind.FRAME_ANSWER),
             transfers.cancel,
             self._passed.given,
@@ -175,7 +173,7 @@ class Exchange:
             HostChoice(group),
             sensor,
             clock,
-            encoding,
+            work,
             partial(self._hand, BlobKind.POSE_REQUEST),
             transfers.cancel,
             options.inter,

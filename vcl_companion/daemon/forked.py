@@ -22,6 +22,7 @@ from collections.abc import Mapping
 from concurrent.futures import Future
 from typing import Any
 
+from vcl_companion.daemon.scheduling import run_before_others
 from vcl_companion.daemon.usage import Usage, usage_of
 from vcl_companion.daemon.worker import Worker
 
@@ -47,9 +48,11 @@ class Forked:
             each other.
         lanes: niceness above ours of each thread of the child's, by name. A thread does one
             call after the other.
+        realtime: whether our own ends of it go before other programs, where that is
+            permitted: they hold the interpreter's lock now and then.
     """
 
-    def __init__(self, target: object, lanes: Mapping[str, int]) -> None:
+    def __init__(self, target: object, lanes: Mapping[str, int], *, realtime: bool = False) -> None:
         self._socket, other = socket.socketpair()
         sys.stdout.flush()
         sys.stderr.flush()
@@ -64,6 +67,9 @@ class Forked:
         self._is_lost = False
         # Never the event loop's thread: the child may be slow to read.
         self._writer = Worker("to-forked")
+        self._realtime = realtime
+        if realtime:
+            self._writer.submit(run_before_others)
         self._reader = threading.Thread(target=self._read, name="from-forked", daemon=True)
         self._reader.start()
 
@@ -119,6 +125,8 @@ class Forked:
             self._answer(number, False, error)
 
     def _read(self) -> None:
+        if self._realtime:
+            run_before_others()
         with contextlib.suppress(OSError, EOFError):
             while True:
                 self._answer(*_receive(self._socket))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from collections.abc import Callable
-from concurrent.futures import Executor
 from dataclasses import dataclass
+
+import numpy as np
 
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
@@ -15,9 +15,9 @@ from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.mailbox import PeerMailbox
+from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.geometry.rotation import quaternion_from_matrix
 from vcl_companion.links.autopilot import AutopilotLink
-from vcl_companion.mapping.drone_view import encode_image
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.wire.frame_codec import FrameAnswer, encode_frame
 from vcl_companion.wire.messages import FrameRequest
@@ -59,7 +59,7 @@ class FrameAnswers:
         sensor: of our camera.
         clock: time base of frames.
         log: told of a frame that cannot be sent.
-        executor: runs the encoding.
+        work: does the encoding.
         hand: sends an answer to a peer; returns the transfer's id.
         cancel: ends a transfer, one that is over already too.
         given: told of every frame that is given to a peer.
@@ -75,7 +75,7 @@ class FrameAnswers:
         sensor: Sensor,
         clock: Clock,
         log: FlightLog,
-        executor: Executor,
+        work: MapWork,
         hand: Callable[[int, bytes], int],
         cancel: Callable[[int], None],
         given: Callable[[FrameAnswer], None],
@@ -88,7 +88,7 @@ class FrameAnswers:
         self._sensor = sensor
         self._clock = clock
         self._log = log
-        self._executor = executor
+        self._work = work
         self._hand = hand
         self._cancel = cancel
         self._note_given = given
@@ -153,10 +153,7 @@ class FrameAnswers:
         if self._estimator.is_localized(self._clock.now_ns()):
             await self._estimator.looked_at(at_ns, _SETTLE_S)
         state = self._estimator.own_fix_at(at_ns)
-        loop = asyncio.get_running_loop()
-        image_bytes = await loop.run_in_executor(
-            self._executor, encode_image, frame.image, self._keyframe_quality
-        )
+        image_bytes = await self._work.encode(np.asarray(frame.image), self._keyframe_quality)
         return FrameAnswer(
             drone_id=self._system_id,
             request_id=request_id,

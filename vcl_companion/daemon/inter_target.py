@@ -6,7 +6,6 @@ import asyncio
 import logging
 import math
 from collections.abc import Callable
-from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -15,8 +14,8 @@ import numpy as np
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
 from vcl_companion.daemon.estimator import HISTORY_S
+from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.geometry.rotation import Array, quaternion_from_matrix
-from vcl_companion.mapping.drone_view import encode_image
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
 from vcl_companion.wire.frame_codec import FrameAnswer
@@ -73,7 +72,7 @@ class InterTarget:
         hosts: whom to ask.
         sensor: of our camera.
         clock: time base of frames.
-        executor: runs the encoding.
+        work: does the encoding.
         hand: sends a blob of a request to a peer; returns the transfer's id.
         cancel: ends a transfer, one that is over already too.
         options: how often, how many, how long.
@@ -88,7 +87,7 @@ class InterTarget:
         hosts: HostChoice,
         sensor: Sensor,
         clock: Clock,
-        executor: Executor,
+        work: MapWork,
         hand: Callable[[int, bytes], int],
         cancel: Callable[[int], None],
         options: InterMavOptions,
@@ -99,7 +98,7 @@ class InterTarget:
         self._hosts = hosts
         self._sensor = sensor
         self._clock = clock
-        self._executor = executor
+        self._work = work
         self._only_the_surer = only_the_surer
         self._hand = hand
         self._cancel = cancel
@@ -222,8 +221,8 @@ class InterTarget:
         Raises:
             ValueError: the frame cannot be encoded, or is larger than peers accept.
         """
-        image_bytes = await asyncio.get_running_loop().run_in_executor(
-            self._executor, encode_image, asked.frame.image, self._options.request_quality
+        image_bytes = await self._work.encode(
+            np.asarray(asked.frame.image), self._options.request_quality
         )
         attitude = asked.ned_from_body
         frame = FrameAnswer(

@@ -15,29 +15,31 @@ class Mailbox:
 
     def __init__(self) -> None:
         self._frame: Frame | None = None
+        self._newest: Frame | None = None
         self._filled = asyncio.Event()
 
     def put(self, frame: Frame) -> Frame | None:
         """Leave a frame; return the older one whose place it took, if one was still there."""
         replaced, self._frame = self._frame, frame
+        self._newest = frame
         self._filled.set()
         return replaced
 
-    @property
-    def is_filled(self) -> bool:
-        """Whether a frame is here."""
-        return self._frame is not None
+    def has_had_newer(self, frame: Frame) -> bool:
+        """Whether a frame has come after one that was here, taken since or not."""
+        return self._newest is not frame
 
-    async def filled(self) -> None:
-        """Wait until a frame is here; leave it."""
-        while self._frame is None:
+    async def newer_than(self, frame: Frame) -> None:
+        """Wait until a frame has come after one that was here; leave it."""
+        while not self.has_had_newer(frame):
             self._filled.clear()
             await self._filled.wait()
 
     async def take(self) -> Frame:
         """Wait for a frame and take it out; of several takers one gets it."""
         while self._frame is None:
-            await self.filled()
+            self._filled.clear()
+            await self._filled.wait()
         frame, self._frame = self._frame, None
         return frame
 

@@ -316,8 +316,13 @@ class MapSharing:
         await loop.run_in_executor(self._disk, give_back_freed)
 
     def _want_more_of(self, stored: StoredMap) -> None:
-        if self._maps.is_in_use(stored):
-            self._maps.want_more()
+        if not self._maps.is_in_use(stored):
+            return
+        if self._group.wanting_update:
+            # It is about to be replaced, and the next one wants the processor now.
+            asyncio.get_running_loop().call_later(_STAYS_S, self._want_more_of, stored)
+            return
+        self._maps.want_more()
 
     async def _index_more(self) -> None:
         """Index the map in use by the other detectors when that is asked for, once each.

@@ -14,18 +14,23 @@ from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.usage import Usage
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.daemon.workshop import NotHereError, Workshop
+from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.inter import NoProposal, Proposal
+from vcl_companion.localization.intra import Localized, NotLocalized, Prior
 from vcl_companion.localization.map_index import MapIndex
+from vcl_companion.localization.pipeline import Effort
 from vcl_companion.localization.pose_filter import FilterState
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import NoMap
+from vcl_companion.vision.features import Image
 from vcl_companion.wire.frame_codec import FrameAnswer
 
 _log = logging.getLogger(__name__)
 
-_MAPS, _PEERS = "maps", "peers"
-# Niceness of map making above the frames', and of looking for peers' poses.
-_LANES = {_MAPS: 8, _PEERS: 12}
+_MAPS, _IMAGES, _FRAMES, _PEERS = "maps", "images", "frames", "peers"
+# Niceness of each above the frames that are followed. Who is lost leaves the map that will show
+# where as much time as it takes; with half of these peers would get half of the machine's.
+_LANES = {_MAPS: 8, _IMAGES: 4, _FRAMES: 8, _PEERS: 12}
 
 
 class MapWork:
@@ -35,12 +40,18 @@ class MapWork:
         workshop: what does it.
         forks: whether in a process of its own, which begins now: no other thread may be at
             work. Should it be lost, or with False, threads of this process do the work.
+        realtime: whether the frames beside go before other programs; see ``Forked``.
     """
 
-    def __init__(self, workshop: Workshop, *, forks: bool) -> None:
+    def __init__(self, workshop: Workshop, *, forks: bool, realtime: bool = False) -> None:
         self._workshop = workshop
-        self._process = Forked(workshop, _LANES) if forks else None
+        self._process = Forked(workshop, _LANES, realtime=realtime) if forks else None
         self._threads: dict[str, Worker] = {}
+
+    async def encode(self, image: Image, quality: int) -> bytes:
+        """See ``Workshop``."""
+        data: bytes = await self._do(_IMAGES, "encode", image, quality)
+        return data
 
     async def look_at(self, frame: FrameAnswer) -> None:
         """See ``Workshop``."""
@@ -78,6 +89,20 @@ class MapWork:
         """See ``Workshop``."""
         index: MapIndex = await self._do_with(stored, _PEERS, "more_indexed", stored.revision)
         return index.of_the_same_map(stored.index)
+
+    async def find(
+        self,
+        image: Image,
+        stored: StoredMap,
+        prior: Prior | None,
+        ned_from_body: Array | None,
+        effort: Effort,
+    ) -> Localized | NotLocalized:
+        """See ``Workshop``."""
+        found: Localized | NotLocalized = await self._do_with(
+            stored, _FRAMES, "find", image, stored.revision, prior, ned_from_body, effort
+        )
+        return found
 
     async def place_of_peer(
         self, frame: Frame, state: FilterState, stored: StoredMap, seen: FrameAnswer

@@ -44,6 +44,12 @@ def peak_resident_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
+def forget_peak() -> None:
+    """Have ``peak_resident_mb`` begin anew (Linux); what it would have said is lost."""
+    with suppress(OSError):
+        (_PROC / "self/clear_refs").write_text("5", encoding="ascii")
+
+
 def usage_of(forked_pid: int) -> Usage:
     """Return what a process forked off this one has taken, without what it shares with us now.
 

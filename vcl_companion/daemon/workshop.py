@@ -1,7 +1,7 @@
-"""What takes seconds: maps built, made ready to be flown on, and looked up for peers.
+"""What takes long: maps built, made ready to be flown on, searched for frames and for peers.
 
 It keeps what it has made and found, so that a map is named rather than handed over
-once more. One thread makes maps, another one looks for peers.
+once more. One thread makes maps, one encodes our frames, one looks for them, one for peers.
 """
 
 from __future__ import annotations
@@ -16,20 +16,24 @@ from vcl_companion.daemon.map_offer import HandOut, MapOffer, ReadyMap, ready_ma
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.peer_look import PeerLook
 from vcl_companion.daemon.usage import give_back_freed
+from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.inter import NoProposal, Proposal
+from vcl_companion.localization.intra import Localized, NotLocalized, Prior
 from vcl_companion.localization.map_index import MapIndex
+from vcl_companion.localization.pipeline import Effort, PipelineOptions, localize
 from vcl_companion.localization.pose_filter import FilterState
+from vcl_companion.mapping.drone_view import encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.pose_requests import InterMavOptions
-from vcl_companion.vision.features import Detector, FeatureOptions
+from vcl_companion.vision.features import Detector, Image
 from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.map_codec import encode_map, revision_of
 from vcl_companion.wire.map_update import encode_map_update
 
-# The one in use, the next one, and one that somebody still looks at.
-_N_MAPS = 3
+# The one in use, and the next one.
+_N_MAPS = 2
 
 
 class NotHereError(Exception):
@@ -43,7 +47,7 @@ class WorkOptions:
     Attributes:
         known_distances: (drone, drone, metres).
         map: thresholds of the building.
-        features: how they are found.
+        pipeline: of looking for a frame; how features are found.
         detectors: the localization's own, and what it falls back on.
         inter: of looking for peers.
         tracked: whether maps are made ready to be tracked by their patches; then every
@@ -52,7 +56,7 @@ class WorkOptions:
 
     known_distances: Distances
     map: MapOptions
-    features: FeatureOptions
+    pipeline: PipelineOptions
     detectors: tuple[Detector, ...]
     inter: InterMavOptions
     tracked: bool
@@ -67,12 +71,12 @@ class Workshop:
     """
 
     def __init__(self, sensor: Sensor, options: WorkOptions) -> None:
+        self._sensor = sensor
         self._options = options
-        self._memory = FeatureMemory(options.features)
-        self._other_memory = FeatureMemory(options.features)  # the other thread's
-        self._look = PeerLook(
-            sensor, options.features, options.inter, options.detectors, options.tracked
-        )
+        features = options.pipeline.features
+        self._memory = FeatureMemory(features)
+        self._other_memory = FeatureMemory(features)  # another thread's
+        self._look = PeerLook(sensor, features, options.inter, options.detectors, options.tracked)
         self._maps: dict[bytes, StoredMap] = {}
 
     def learn(self, stored: StoredMap) -> None:
@@ -81,6 +85,10 @@ class Workshop:
         self._maps[stored.revision] = stored
         while len(self._maps) > _N_MAPS:
             del self._maps[next(iter(self._maps))]
+
+    def encode(self, image: Image, quality: int) -> bytes:
+        """Return one of our frames as peers get it; see ``encode_image``."""
+        return encode_image(image, quality)
 
     def look_at(self, frame: FrameAnswer) -> None:
         """Find the features of a frame that a map will be made of, before it is.
@@ -130,7 +138,7 @@ class Workshop:
         options = self._options
         stored = self._named(current) if current else None
         ready = ready_map(
-            offer, stored, options.detectors[0], options.features, self._memory,
+            offer, stored, options.detectors[0], options.pipeline.features, self._memory,
             options.tracked, held,
         )  # fmt: skip
         self.learn(ready.stored())
@@ -142,12 +150,34 @@ class Workshop:
         stored = self._named(revision)
         options = self._options
         index = with_fallbacks(
-            stored.index, options.detectors[1:], options.features, self._other_memory
+            stored.index, options.detectors[1:], options.pipeline.features, self._other_memory
         )
         if revision in self._maps:
             self._maps[revision] = replace(stored, index=index)
         give_back_freed()
         return index
+
+    def find(
+        self,
+        image: Image,
+        revision: bytes,
+        prior: Prior | None,
+        ned_from_body: Array | None,
+        effort: Effort,
+    ) -> Localized | NotLocalized:
+        """Look for one of our frames by its features; see ``localize``."""
+        stored = self._named(revision)
+        return localize(
+            image,
+            self._sensor.camera,
+            self._sensor.body_from_cam,
+            stored.index,
+            stored.templates,
+            prior,
+            ned_from_body,
+            self._options.pipeline,
+            effort,
+        )
 
     def place_of_peer(
         self, frame: Frame, state: FilterState, revision: bytes, seen: FrameAnswer

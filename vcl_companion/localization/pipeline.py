@@ -51,11 +51,14 @@ class Effort:
     """What may be tried that takes as long as several frames.
 
     Attributes:
+        may_track: whether patches are followed from the prediction; else features alone are
+            asked, as when patches gave no pose a moment ago.
         may_search: whether features are looked for when patches alone give no pose.
         may_doubt: whether features are asked about a pose that few patches agree on.
         may_fall_back: whether a second detector is asked when the first one fails.
     """
 
+    may_track: bool = True
     may_search: bool = True
     may_doubt: bool = True
     may_fall_back: bool = True
@@ -97,7 +100,7 @@ def localize(
         features said, for they were asked last.
     """
     tracked: Localized | NotLocalized | None = None
-    if templates is not None and prior is not None:
+    if templates is not None and prior is not None and effort.may_track:
         tracked = track(
             image, camera, body_from_cam, templates, prior, ned_from_body,
             options.tracking, options.localization,
@@ -111,7 +114,7 @@ def localize(
             more = isinstance(again, Localized) and again.n_inliers > tracked.n_inliers
             return again if more else tracked
     if templates is not None and not effort.may_search:
-        return tracked or NotLocalized("lost, and looked for in vain a moment ago")
+        return tracked or NotLocalized("lost, and not looked for again yet")
     found = _recognised(
         image, camera, body_from_cam, index, templates, prior, ned_from_body, options
     )

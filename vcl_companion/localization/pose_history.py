@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.localization.intra import Localized
+from vcl_companion.localization.intra import Localized, NotLocalized
 from vcl_companion.localization.pose_filter import (
     FilterOptions,
     FilterState,
@@ -72,7 +72,7 @@ class PoseHistory:
     def append(
         self, state: FilterState, fix: Localized | None, ned_from_body: Array | None
     ) -> None:
-        """Keep the state after a frame.
+        """Keep the state after a frame; in the place of what it was before, for the last one.
 
         Args:
             state: predicted to the frame's instant, and updated by its fix if any.
@@ -84,6 +84,8 @@ class PoseHistory:
         """
         if self._steps and state.at_ns < self._steps[-1].state.at_ns:
             raise ValueError("states must come in the order of their time")
+        if self._steps and state.at_ns == self._steps[-1].state.at_ns:
+            self._steps.pop()
         self._steps.append(_Step(state, fix, ned_from_body))
         while self._steps[0].state.at_ns < state.at_ns - self._length_ns:
             self._steps.popleft()
@@ -111,18 +113,44 @@ class PoseHistory:
         fused = fuse(self._steps[k].state, world_from_body, covariance, arm_m)
         if isinstance(fused, NotFused):
             return fused
-        replayed = [_Step(fused, self._steps[k].fix, self._steps[k].ned_from_body)]
+        if not self._replay(k, _Step(fused, self._steps[k].fix, self._steps[k].ned_from_body)):
+            return NotFused("the state is too old to go on from")
+        return self._steps[-1].state
+
+    def refit(self, at_ns: int, fix: Localized) -> FilterState | NotLocalized:
+        """Take in what a frame gave after later ones had been, and bring these up to date.
+
+        Args:
+            at_ns: instant of the frame, which was kept without a fix then.
+            fix: what it gave.
+
+        Returns:
+            The state of that instant with the fix in it, or why it was not taken.
+        """
+        k = self._nearest(at_ns)
+        if k is None or self._steps[k].fix is not None:
+            return NotLocalized("found after a later frame had been")
+        updated = update(self._steps[k].state, fix)
+        if isinstance(updated, NotLocalized):
+            return updated
+        if not self._replay(k, _Step(updated, fix, self._steps[k].ned_from_body)):
+            return NotLocalized("the state is too old to go on from")
+        return updated
+
+    def _replay(self, k: int, changed: _Step) -> bool:
+        """Change a step, and apply again what came after it; False where that cannot be."""
+        replayed = [changed]
         for step in list(self._steps)[k + 1 :]:
             state = predict(replayed[-1].state, step.state.at_ns, step.ned_from_body, self._options)
             if state is None:
-                return NotFused("the state is too old to go on from")
+                return False
             if step.fix is not None:
                 updated = update(state, step.fix)
                 state = updated if isinstance(updated, FilterState) else state
             replayed.append(_Step(state, step.fix, step.ned_from_body))
         for n, step in enumerate(replayed):
             self._steps[k + n] = step
-        return replayed[-1].state
+        return True
 
     def _nearest(self, at_ns: int) -> int | None:
         """Return the place of the step of an instant, None when there is none."""

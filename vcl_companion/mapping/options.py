@@ -41,7 +41,7 @@ class MapOptions:
     max_depth_error: float = 0.1
     patches: bool = True
     landmarks_per_cell: int = 4
-    max_keyframes: int = 24
+    max_keyframes: int = 18
     max_landmarks: int = 12_000
     member_wait_s: float = 10.0
     gather_timeout_s: float = 20.0

@@ -78,8 +78,8 @@ class UpdateOptions:
     novelty_deg: float = 5.0
     sigma_m: float = 0.005
     sigma_growth: float = 1.5
-    hold_s: float = 0.5
-    interval_s: float = 1.0
+    hold_s: float = 0.3
+    interval_s: float = 0.5
     gather_timeout_s: float = 5.0
     delivery_wait_s: float = 30.0
     lost_s: float = 3.0
