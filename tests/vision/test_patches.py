@@ -109,14 +109,47 @@ def test_the_affine_map_is_the_derivative_of_the_true_mapping(camera: Camera) ->
         point = np.array([p, q, 1.0]) / (r + b * (p - x) + c * (q - y))
         return np.asarray(camera.project(frame_from_key.apply(point)[None])[0])
 
-    out, lens = np.empty(13), lens_of(camera)
+    out, lens = np.empty(15), lens_of(camera)
     plane = np.array([x, y, r, b, c, *slopes])
     transform = np.ascontiguousarray(frame_from_key.matrix()[:3])
     assert seen_from(plane, lens.table, lens.reach, transform, out)
     assert np.allclose(out[3:5], elsewhere(pixel), atol=1e-6)
-    assert np.allclose(out[9:].reshape(2, 2), numeric_jacobian(elsewhere, pixel, 1e-3), atol=1e-3)
+    assert np.allclose(out[9:13].reshape(2, 2), numeric_jacobian(elsewhere, pixel, 1e-3), atol=1e-3)
     behind = np.ascontiguousarray(Pose(exp_so3(np.array([0, np.pi, 0])), np.zeros(3)).matrix()[:3])
     assert not seen_from(plane, lens.table, lens.reach, behind, out)
+
+
+def street(camera: Camera, height_m: float, back_m: float, rng: np.random.Generator) -> Image:
+    """A painted street below a level camera, its optical axis ahead, so far behind the origin."""
+    waves = rng.standard_normal((60, 2)) * 6.0
+    phases = rng.uniform(0.0, 2.0 * np.pi, 60)
+    fine = (np.arange(3 * camera.height_px) + 0.5) / 3 - 0.5
+    across = (np.arange(3 * camera.width_px) + 0.5) / 3 - 0.5
+    columns, rows = np.meshgrid(across, fine)
+    ideal = camera.ideal_from_pixels(np.column_stack([columns.ravel(), rows.ravel()]))
+    depth = height_m / np.maximum(ideal[:, 1], 0.02)
+    ground = np.column_stack([ideal[:, 0] * depth, depth - back_m])
+    light = sum(np.sin(ground @ w + p) for w, p in zip(waves, phases, strict=True))
+    grey = np.clip(128.0 + 9.0 * np.asarray(light), 0, 255).reshape(rows.shape).astype(np.float32)
+    size = camera.width_px, camera.height_px
+    return np.rint(cv2.resize(grey, size, interpolation=cv2.INTER_AREA)).astype(np.uint8)
+
+
+def test_patches_of_the_ground_are_found_where_they_are_from_farther_away() -> None:
+    """What an affine warp leaves out of a receding surface pushes all its patches to one side."""
+    camera, height_m, back_m = replace(PINHOLE, cy_px=60.0), 3.0, 4.0
+    near, far = (street(camera, height_m, b, np.random.default_rng(3)) for b in (0.0, back_m))
+    pixels = np.random.default_rng(7).uniform([60.0, 240.0], [580.0, 440.0], (300, 2))
+    anchors = anchored(near, pixels, camera)
+    planes = anchors.planes.copy()
+    planes[:, 2] = planes[:, 1] / height_m
+    planes[:, 4] = 1.0 / height_m
+    anchors = replace(anchors, planes=planes)
+    found = aligned(anchors, far, Pose(np.eye(3), np.array([0.0, 0.0, back_m])), camera=camera)
+    error = (found.pixels - found.predicted)[found.found]
+    assert found.found.mean() > 0.8
+    assert np.abs(np.median(error, axis=0)).max() < 0.01
+    assert np.median(np.abs(error), axis=0).max() < 0.05
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, -0.4), (1.7, 0.9), (-2.2, 1.4)])

@@ -4,7 +4,10 @@ A landmark is anchored in a keyframe: an ideal image point (x, y) there with an
 inverse depth linear in it, r + b dx + c dy, which is what a plane looks like.
 With frame_from_key (R, t) it appears in the frame along R (x, y, 1) + t r; the
 derivative of that by (x, y), between the slopes of both lenses, is the local
-affine map of the two raw images.
+affine map of the two raw images; over a patch of a surface that recedes fast,
+as the ground does, the foreshortening itself changes, so a patch is warped by
+the homography of its plane: by an affine map alone a street's patches are 0.06 px
+and more off, all to the same side, and the map is tilted.
 
 Layout of the tables (all float64 unless said):
   planes (A, 9): x, y, r, b, c of each anchor, ideal units and 1/m, then the four
@@ -33,6 +36,8 @@ HALF = 4
 SIDE = 2 * HALF + 1
 # By how much bilinear interpolation reduces the variance of white noise, on average.
 _SMOOTHED = 4.0 / 9.0
+# Where a patch's far side is so many times farther than its middle, it is edge on.
+_LEAST_DIVISOR = 0.5
 # Why a patch was not found.
 FOUND, OUTSIDE, FLAT, UNLIKE, WANDERED, UNSETTLED = 0, 1, 2, 3, 4, 5
 
@@ -76,8 +81,10 @@ def bent(lens: Array, x: float, y: float) -> tuple[float, float, float, float, f
 def seen_from(plane: Array, lens: Array, reach: float, transform: Array, out: Array) -> bool:
     """Fill what one anchor looks like from a frame; False where it cannot be seen.
 
-    ``out`` (13,): ideal x, y; 1/depth in the frame; pixel u, v; slopes of the
-    lens there (4); the affine map d(frame pixel) / d(keyframe pixel) (4).
+    ``out`` (15,): ideal x, y; 1/depth in the frame; pixel u, v; slopes of the
+    lens there (4); the affine map d(frame pixel) / d(keyframe pixel) (4); how the
+    keyframe's depth of the plane over the frame's changes, relatively, per pixel
+    of the frame (2).
     """
     x, y, r, b, c = plane[0], plane[1], plane[2], plane[3], plane[4]
     q0 = transform[0, 0] * x + transform[0, 1] * y + transform[0, 2] + transform[0, 3] * r
@@ -102,6 +109,12 @@ def seen_from(plane: Array, lens: Array, reach: float, transform: Array, out: Ar
     out[5], out[6], out[7], out[8] = ux, uy, vx, vy
     out[9], out[10] = mxx * ixx + mxy * iyx, mxx * ixy + mxy * iyy
     out[11], out[12] = myx * ixx + myy * iyx, myx * ixy + myy * iyy
+    # The last row of the inverse homography, as one over its value at the point.
+    gx, gy, g1 = q1x * q2y - q2x * q1y, q2x * q0y - q0x * q2y, q0x * q1y - q1x * q0y
+    weight = (gx * ideal_x + gy * ideal_y + g1) * (ux * vy - uy * vx)
+    if not abs(weight) > 1e-12:
+        return False
+    out[13], out[14] = (vy * gx - vx * gy) / weight, (ux * gy - uy * gx) / weight
     # A patch seen from behind, or edge on, says nothing.
     return bool(out[9] * out[12] - out[10] * out[11] > 1e-3)
 
@@ -139,14 +152,15 @@ def sampled(texels: Texels, start: int, height: int, width: int, u: float, v: fl
 def warped(
     texels: Texels, shelves: Ints, key_u: float, key_v: float, back: Array, out: Array
 ) -> bool:
-    """Fill (SIDE + 2, SIDE + 2) grey levels of a keyframe around a pixel, by an affine map.
+    """Fill (SIDE + 2, SIDE + 2) grey levels of a keyframe around a pixel, by a homography.
 
     Args:
         texels: of all keyframes.
         shelves: (L, 3) the keyframe's pyramid.
         key_u: column of the patch's centre in the keyframe.
         key_v: its row.
-        back: (4,) d(keyframe pixel) / d(patch pixel).
+        back: (6,) d(keyframe pixel) / d(patch pixel) at the centre, and the relative change
+            per patch pixel of what divides it.
         out: the patch with a margin of one.
 
     Returns:
@@ -158,20 +172,26 @@ def warped(
     share = depth - level
     n_levels = 2 if share > 0.0 else 1
     reach = HALF + 1
+    e, f = back[4], back[5]
+    least = 1.0 - reach * (abs(e) + abs(f))
+    if not least > _LEAST_DIVISOR:
+        return False
     for step in range(n_levels):
         start, height, width = shelves[level + step]
         shrink = 1.0 / (1 << (level + step))
         weight = share if step == 1 else 1.0 - share
         su, sv = key_u * shrink, key_v * shrink
         a, b, c, d = back[0] * shrink, back[1] * shrink, back[2] * shrink, back[3] * shrink
-        far_u, far_v = reach * (abs(a) + abs(b)), reach * (abs(c) + abs(d))
+        far_u, far_v = reach * (abs(a) + abs(b)) / least, reach * (abs(c) + abs(d)) / least
         if not (su - far_u >= 0.0 and sv - far_v >= 0.0):
             return False
         if not (su + far_u < width - 1.0 and sv + far_v < height - 1.0):
             return False
         for i in range(-reach, reach + 1):
             for j in range(-reach, reach + 1):
-                grey = sampled(texels, start, height, width, su + a * j + b * i, sv + c * j + d * i)
+                scaled = 1.0 / (1.0 + e * j + f * i)
+                u, v = su + (a * j + b * i) * scaled, sv + (c * j + d * i) * scaled
+                grey = sampled(texels, start, height, width, u, v)
                 if step == 0:
                     out[i + reach, j + reach] = weight * grey
                 else:
@@ -227,7 +247,7 @@ def choose(
     n = len(first) - 1
     anchors, cells = np.empty(n, np.int64), np.empty(n, np.int64)
     jacobians, informations, worth = np.empty((n, 12)), np.empty((n, 3)), np.empty(n)
-    view = np.empty(13)
+    view = np.empty(15)
     j_cam, j_pose = np.empty((2, 3)), np.empty((2, 6))
     total = np.zeros((6, 6))
     columns, rows = int(image[0] / rules[0]) + 1, int(image[1] / rules[0]) + 1
@@ -442,10 +462,10 @@ def align(
     pixels, ideals, slopes = np.full((m, 4), np.nan), np.zeros((m, 2)), np.zeros((m, 2, 2))
     noises, misplaced = np.zeros((m, 3)), np.zeros((m, 3))
     marks, status = np.zeros((m, 2)), np.full(m, OUTSIDE)
-    view = np.empty(13)
+    view = np.empty(15)
     patch = np.empty((SIDE + 2, SIDE + 2))
     basis = np.empty((3, SIDE, SIDE))
-    back = np.empty(4)
+    back = np.empty(6)
     normal, inverse = np.empty((3, 3)), np.empty((3, 3))
     for i in range(m):
         anchor = chosen[i]
@@ -460,6 +480,7 @@ def align(
         size = float(1 << level)
         back[0], back[1] = size * view[12] / det, -size * view[10] / det
         back[2], back[3] = -size * view[11] / det, size * view[9] / det
+        back[4], back[5] = size * view[13], size * view[14]
         pixels[i, 0], pixels[i, 1], marks[i, 1] = view[3], view[4], size
         if not warped(
             texels, shelves[k], key_pixels[anchor, 0], key_pixels[anchor, 1], back, patch
