@@ -48,6 +48,29 @@ def test_one_bad_frame_changes_nothing() -> None:
     assert not voted([PLENTY] * 20 + [1500, 1500] + [PLENTY] * 20)
 
 
+def test_who_will_have_lost_half_when_an_update_is_there_votes_before() -> None:
+    """Sixty landmarks a second: below 0.6 of 400 after 2.7 s, foreseen 1.5 s before."""
+    falling = [PLENTY] * 20 + [PLENTY - 6 * k for k in range(40)]
+    votes = [voted(falling[: 20 + k]) for k in range(1, 40)]
+    assert not any(votes[:11])
+    assert all(votes[18:])
+    # A course that is none: a step, however steep, and coming and going.
+    assert not voted([PLENTY] * 20 + [PLENTY - 100] * 10)
+    assert not any(voted([PLENTY - 50 * (k % 3 == n % 3) for k in range(n)]) for n in range(1, 40))
+
+
+def test_what_fills_less_and_less_and_what_looks_ever_newer_is_foreseen() -> None:
+    def seen(sights: list[Sight]) -> bool:
+        vote = OwnVote(OPTIONS)
+        return [vote.look(FIRST, sight, k * STEP_S) for k, sight in enumerate(sights)][-1]
+
+    still = [Sight(PLENTY, 0.95, 0.001, 1.0)] * 20
+    assert not seen(still)
+    assert seen(still + [Sight(PLENTY, 0.95 - 0.02 * k, 0.001, 1.0) for k in range(12)])
+    assert seen(still + [Sight(PLENTY, 0.95, 0.001, 1.0 + 0.2 * k) for k in range(12)])
+    assert not seen(still + [Sight(PLENTY, 0.95 - 0.002 * k, 0.001, 1.0) for k in range(12)])
+
+
 def test_a_vote_stands_until_the_new_map_has_been_seen_for_a_while() -> None:
     vote = OwnVote(OPTIONS)
     for k in range(20):

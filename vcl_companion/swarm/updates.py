@@ -1,7 +1,8 @@
 """When the map is to be updated (IV-G): each drone's vote, and the coordinator's patience.
 
 No clock and no socket: the owner says what time it is. A drone votes for an
-update when one of these holds for the median of its last second:
+update when one of these holds for the median of its last second, or, of the
+first three, will hold ``ahead_s`` from now if the second goes on as it went:
 
 * landmarks in sight < max(``tracked``, ``share`` x most since this revision);
 * covered share of the image < min(``covered``, 0.8 x most since this revision):
@@ -27,8 +28,10 @@ from vcl_companion.swarm.group import Group
 
 # One bad frame is no reason to vote: a vote is about the median of so long, s.
 _WINDOW_S = 1.0
-# A new map is not judged by less than this share of the window.
+# A new map is not judged by less than this share of the window, nor where it leads by less
+# than nearly all of it.
 _JUDGED_SHARE = 0.5
+_FORESEEN_SHARE = 0.85
 # A view that is never covered more, by sky perhaps, is no reason to update.
 _STILL_COVERED = 0.8
 # An update that did not help is followed by a longer pause, up to so many intervals.
@@ -51,6 +54,7 @@ class UpdateOptions:
         covered: share of the image that the map has to fill.
         novelty_deg: landmarks are seen from so far aside of where they are remembered, or as
             much nearer or farther (``localization.coverage``), before the map is extended.
+        ahead_s: a map is judged by what will be seen of it when an update, begun now, is there.
         sigma_m: positions better than this are good enough.
         sigma_growth: above that, a drone wants an update when its position is known
             so many times worse than it was at best on this revision.
@@ -76,6 +80,7 @@ class UpdateOptions:
     share: float = 0.6
     covered: float = 0.7
     novelty_deg: float = 5.0
+    ahead_s: float = 1.5
     sigma_m: float = 0.005
     sigma_growth: float = 1.5
     hold_s: float = 0.3
@@ -98,6 +103,7 @@ class UpdateOptions:
             raise ValueError(f"sigma_growth must be more than 1, got {self.sigma_growth}")
         for name in (
             "novelty_deg",
+            "ahead_s",
             "sigma_m",
             "hold_s",
             "interval_s",
@@ -181,21 +187,46 @@ class OwnVote:
 
     def _is_little(self) -> bool:
         # Half of the window does not outvote the other half.
-        lately = statistics.median_high(s.tracked for _, s in self._seen)
+        seen = [(at_s, float(s.tracked)) for at_s, s in self._seen]
+        lately = statistics.median_high(n for _, n in seen)
         self._most = max(self._most, lately)
-        return lately < max(self._options.tracked, self._options.share * self._most)
+        least = max(self._options.tracked, self._options.share * self._most)
+        return min(lately, self._foreseen(seen, lately)) < least
 
     def _is_narrow(self) -> bool:
-        known = [s.covered for _, s in self._seen if s.covered is not None]
+        known = [(at_s, s.covered) for at_s, s in self._seen if s.covered is not None]
         if not known:
             return False
-        lately = statistics.median_high(known)
+        lately = statistics.median_high(share for _, share in known)
         self._most_covered = max(self._most_covered, lately)
-        return lately < min(self._options.covered, _STILL_COVERED * self._most_covered)
+        least = min(self._options.covered, _STILL_COVERED * self._most_covered)
+        return min(lately, self._foreseen(known, lately)) < least
 
     def _is_new(self) -> bool:
-        lately_deg = statistics.median_low(s.novelty_deg for _, s in self._seen)
-        return lately_deg > self._options.novelty_deg
+        seen = [(at_s, s.novelty_deg) for at_s, s in self._seen]
+        lately_deg = statistics.median_low(novelty for _, novelty in seen)
+        return max(lately_deg, self._foreseen(seen, lately_deg)) > self._options.novelty_deg
+
+    def _foreseen(self, values: list[tuple[float, float]], lately: float) -> float:
+        """Return what a quantity will be if it goes on as it does, if it goes anywhere.
+
+        By the medians of the window's thirds, and no faster than between any two of them:
+        neither a bad frame nor a step is a course.
+        """
+        now_s = self._seen[-1][0]
+        if values[0][0] > now_s - _FORESEEN_SHARE * _WINDOW_S:
+            return lately
+        third_s = _WINDOW_S / 3.0
+        thirds: tuple[list[float], ...] = ([], [], [])
+        for at_s, value in values:
+            thirds[min(int((now_s - at_s) / third_s), 2)].append(value)
+        if not all(thirds):
+            return lately
+        newest, between, oldest = map(statistics.median_low, thirds)
+        steps = newest - between, between - oldest
+        if steps[0] * steps[1] <= 0.0:
+            return lately
+        return newest + min(steps, key=abs) * self._options.ahead_s / third_s
 
     def _is_vague(self) -> bool:
         known = [s.sigma_m for _, s in self._seen if s.sigma_m is not None]
