@@ -39,9 +39,9 @@ def assert_maps_close(a: LandmarkMap, b: LandmarkMap) -> None:
             assert np.array_equal(poses[0].translation, poses[1].translation)
             assert np.abs(poses[0].rotation - poses[1].rotation).max() < 5e-9
     assert a.points_world.shape == b.points_world.shape
-    assert np.abs(a.points_world - b.points_world).max(initial=0.0) <= 2.0**-17
+    assert np.abs(a.points_world - b.points_world).max(initial=0.0) <= 2.0**-13
     assert np.array_equal(a.seen, b.seen)
-    assert np.abs(a.observed_px - b.observed_px)[a.seen].max(initial=0.0) <= 2.0**-7
+    assert np.abs(a.observed_px - b.observed_px)[a.seen].max(initial=0.0) <= 2.0**-6
     for name in ("pixel_noise_px", "detectors", "distances", "parent"):
         assert getattr(a, name) == getattr(b, name)
     assert np.array_equal(a.anchor_covariance, b.anchor_covariance)
@@ -51,7 +51,7 @@ def test_golden_bytes() -> None:
     data = encode_map(small_map())
     assert_golden("map", data)
     assert_maps_close(decode_map(data), small_map())
-    assert revision_of(data).hex() == "16f26e7e031dd223"
+    assert revision_of(data).hex() == "ff15c6f69aafc847"
 
 
 @given(_maps)

@@ -119,9 +119,9 @@ def test_what_has_not_changed_costs_next_to_nothing() -> None:
     heads = len(
         encode_map(replace(parent, points_world=moved[:0], observed_px=parent.observed_px[:0]))
     )
-    # 12 bits of each coordinate's step, and a bit of each sighting, of 22 and 40.
-    assert len(encode_map_update(data, parent)) - heads < 6000
-    assert len(data) - heads > 20_000
+    # 8 bits of each coordinate's step, and a bit of each sighting, of 19 and 32.
+    assert len(encode_map_update(data, parent)) - heads < 4500
+    assert len(data) - heads > 18_000
 
 
 def test_golden_bytes_for_one_who_holds_the_new_image() -> None:

@@ -1,8 +1,10 @@
 """The shared map (IV-C) as bytes, and the revision that names them.
 
 Every accepted map has exactly one byte string: ``encode_map(decode_map(b)) ==
-b``. Points lie on a grid of 2^-16 m and pixels on one of 2^-6 px (both finer
+b``. Points lie on a grid of 2^-12 m and pixels on one of 2^-5 px (both finer
 than what they were measured to); poses, cameras and images are kept exactly.
+A pixel is told as what it is off from where its keyframe would see the point: a
+tenth of a pixel takes a third of the bits of a place in the image.
 """
 
 from __future__ import annotations
@@ -22,8 +24,10 @@ from vcl_companion.wire.columns import (
     Integers,
     encode_bits,
     encode_column,
+    encode_residuals,
     take_bits,
     take_column,
+    take_residuals,
 )
 from vcl_companion.wire.header import (
     HEADER_BYTES,
@@ -72,10 +76,11 @@ _DISTANCE = struct.Struct("<2H2d")
 # body_from_cam), camera, image: see pose_codec
 _KEYFRAME = struct.Struct("<BQ")
 
-# Then three columns x, y, z of N values in steps of 2^-16 m, then for every keyframe N bits
-# (seen there) and two columns u, v of its seen landmarks in steps of 2^-6 px from pixel -1.
-_STEPS_PER_M = 1 << 16
-_STEPS_PER_PX = 1 << 6
+# Then three columns x, y, z of N values in steps of 2^-12 m, then for every keyframe N bits
+# (seen there) and, of its seen landmarks, residuals u and residuals v in steps of 2^-5 px: the
+# pixel from -1 on less the point's projection (none: the middle of the image), both rounded.
+_STEPS_PER_M = 1 << 12
+_STEPS_PER_PX = 1 << 5
 _MARGIN_PX = 1.0  # a subpixel peak may lie a little outside of the image
 
 
@@ -109,8 +114,8 @@ class MapHead:
         """Return the map whose landmarks lie there.
 
         Args:
-            points: (N, 3) steps of 2^-16 m.
-            pixels: (N, V, 2) steps of 2^-6 px, see ``steps_of_pixels``.
+            points: (N, 3) steps of 2^-12 m.
+            pixels: (N, V, 2) steps of 2^-5 px, see ``steps_of_pixels``.
 
         Raises:
             ValueError: they are no landmarks, or out of range.
@@ -130,12 +135,12 @@ class MapHead:
 
 
 def steps_of_points(points_world: Array) -> Integers:
-    """Return (N, 3) points in steps of 2^-16 m."""
+    """Return (N, 3) points in steps of 2^-12 m."""
     return np.rint(points_world * _STEPS_PER_M).astype(np.int64)
 
 
 def steps_of_pixels(observed_px: Array) -> Integers:
-    """Return (..., 2) pixels in steps of 2^-6 px from pixel -1 on; -1 where there is none.
+    """Return (..., 2) pixels in steps of 2^-5 px from pixel -1 on; -1 where there is none.
 
     Raises:
         ValueError: an observation has one of its coordinates only, or lies before that.
@@ -181,7 +186,7 @@ def encode_map(landmark_map: LandmarkMap) -> bytes:
     parts += [encode_column(points[:, axis]) for axis in range(3)]
     for i, keyframe in enumerate(m.keyframes):
         seen = pixels[:, i, 0] >= 0
-        parts += [encode_bits(seen), encode_pixels(pixels[seen, i], keyframe)]
+        parts += [encode_bits(seen), encode_pixels(pixels[seen, i], points[seen], keyframe)]
     data = b"".join(parts)
     if len(data) > MAX_BLOB_BYTES:
         raise ValueError(f"a map of {len(data)} bytes, at most {MAX_BLOB_BYTES}")
@@ -246,7 +251,7 @@ def decode_map(data: bytes) -> LandmarkMap:
         pixels = np.full((head.n_landmarks, len(head.keyframes), 2), -1, dtype=np.int64)
         for i, keyframe in enumerate(head.keyframes):
             seen = take_bits(reader, head.n_landmarks)
-            pixels[seen, i] = take_pixels(reader, int(seen.sum()), keyframe)
+            pixels[seen, i] = take_pixels(reader, points[seen], keyframe)
         reader.finish()
         return head.map_with(points, pixels)
     except ValueError as error:
@@ -334,23 +339,45 @@ def _take_keyframe(reader: Reader) -> Keyframe:
     )
 
 
-def encode_pixels(steps: Integers, keyframe: Keyframe) -> bytes:
-    """Return two columns of (n, 2) steps that lie in a keyframe's image.
+def encode_pixels(steps: Integers, points: Integers, keyframe: Keyframe) -> bytes:
+    """Return the residuals of (n, 2) steps in a keyframe's image that show (n, 3) points.
 
     Raises:
-        ValueError: some do not.
+        ValueError: some lie outside of the image.
     """
     if len(steps) and (steps.min() < 0 or (steps > _largest_steps(keyframe)).any()):
         raise ValueError("an observation lies outside of its image")
-    return encode_column(steps[:, 0]) + encode_column(steps[:, 1])
+    residuals = steps - _expected_steps(points, keyframe)
+    return encode_residuals(residuals[:, 0]) + encode_residuals(residuals[:, 1])
 
 
-def take_pixels(reader: Reader, n: int, keyframe: Keyframe) -> Integers:
-    """Return the (n, 2) steps in a keyframe's image that come next, or raise WireError."""
-    steps = np.stack([take_column(reader, n), take_column(reader, n)], axis=1)
+def take_pixels(reader: Reader, points: Integers, keyframe: Keyframe) -> Integers:
+    """Return the (n, 2) steps in a keyframe's image, of (n, 3) points, that come next.
+
+    Raises:
+        WireError: they are none, or lie outside of the image.
+    """
+    n = len(points)
+    residuals = np.stack([take_residuals(reader, n), take_residuals(reader, n)], axis=1)
+    steps = residuals + _expected_steps(points, keyframe)
     if n and (steps.min() < 0 or (steps > _largest_steps(keyframe)).any()):
         raise WireError("map: an observation lies outside of its image")
     return steps
+
+
+def _expected_steps(points: Integers, keyframe: Keyframe) -> Integers:
+    """Return (n, 2) steps where a keyframe would see points; the middle if outside or nowhere.
+
+    Arithmetic of two machines differs by 1e-11 of a step: where that moves the rounding, an
+    observation is a step off there, and an update made on the other is refused by its revision.
+    """
+    cam_from_world = (keyframe.world_from_body @ keyframe.body_from_cam).inverse()
+    pixels = keyframe.camera.project(cam_from_world.apply(points / _STEPS_PER_M))
+    largest = _largest_steps(keyframe)
+    with np.errstate(invalid="ignore"):
+        steps = np.rint((pixels + _MARGIN_PX) * _STEPS_PER_PX)
+        inside = ((steps >= 0) & (steps <= largest)).all(axis=1, keepdims=True)
+    return np.where(inside, np.nan_to_num(steps), largest // 2).astype(np.int64)
 
 
 def _largest_steps(keyframe: Keyframe) -> Integers:

@@ -6,18 +6,18 @@ new keyframes see it. After version, kind, revision and the head of the map (``m
 
 | u32                | landmarks of the parent P; N bits: which of the map's were among them;  |
 |                    | P bits: which of the parent's those are, in the same order; M of each    |
-| 3 columns of M     | x, y, z of those, less what they were in the parent, steps of 2^-16 m   |
+| 3 residuals of M   | x, y, z of those, less what they were in the parent, steps of 2^-12 m   |
 | 3 columns of N - M | x, y, z of the others                                                   |
 | V times            | of a keyframe that the parent has: one bit for each of the M that the   |
 |                    | parent saw there, whether that stays                                    |
 |                    | u8, a sum: 1 others of the M are seen there, 2 some of the N - M are    |
-|                    | M bits if so, N - M bits if so: which; two columns u, v of all of these |
+|                    | M bits if so, N - M bits if so: which; residuals u, v of all of these   |
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,10 @@ from vcl_companion.wire.columns import (
     Integers,
     encode_bits,
     encode_column,
+    encode_residuals,
     take_bits,
     take_column,
+    take_residuals,
 )
 from vcl_companion.wire.map_codec import (
     MapHead,
@@ -49,7 +51,7 @@ _MORE, _NEW = 1, 2
 # Where a landmark was seen, as one number: place, u and v.
 _BITS = 20
 # What moved farther than this, 16 m, is told as a new one.
-_FAR_STEPS = 1 << 20
+_FAR_STEPS = 1 << 16
 
 
 def encode_landmarks(child: LandmarkMap, parent: LandmarkMap, places: Places) -> bytes:
@@ -73,7 +75,7 @@ def encode_landmarks(child: LandmarkMap, parent: LandmarkMap, places: Places) ->
         _COUNT.pack(len(points_then)),
         encode_bits(_mask(now, len(points))),
         encode_bits(_mask(then, len(points_then))),
-        *(encode_column(axis) for axis in (points[now] - points_then[then]).T),
+        *(encode_residuals(axis) for axis in (points[now] - points_then[then]).T),
         *(encode_column(axis) for axis in points[new].T),
     ]
     for i, place in enumerate(places):
@@ -86,8 +88,8 @@ def encode_landmarks(child: LandmarkMap, parent: LandmarkMap, places: Places) ->
         fresh = pixels[new, i, 0] >= 0
         parts.append(_OF.pack(_MORE * bool(more.any()) + _NEW * bool(fresh.any())))
         parts += [encode_bits(mask) for mask in (more, fresh) if mask.any()]
-        seen = np.concatenate([pixels[now[more], i], pixels[new[fresh], i]])
-        parts.append(encode_pixels(seen, child.keyframes[i]))
+        seen = np.concatenate([now[more], new[fresh]])
+        parts.append(encode_pixels(pixels[seen, i], points[seen], child.keyframes[i]))
     return b"".join(parts)
 
 
@@ -119,8 +121,8 @@ def take_landmarks(
     if len(now) != len(then):
         raise WireError(f"map update: {len(now)} landmarks are {len(then)} of its parent's")
     points = np.empty((n, 3), dtype=np.int64)
-    points[now] = points_then[then] + _take_points(reader, len(now))
-    points[new] = _take_points(reader, len(new))
+    points[now] = points_then[then] + _stacked(take_residuals, reader, len(now))
+    points[new] = _stacked(take_column, reader, len(new))
     pixels = np.full((n, len(head.keyframes), 2), -1, dtype=np.int64)
     for i, (keyframe, place) in enumerate(zip(head.keyframes, places, strict=True)):
         if place is not None:
@@ -136,12 +138,12 @@ def take_landmarks(
             if is_there
         ]
         seen = np.concatenate([np.zeros(0, dtype=np.intp), *rows])
-        pixels[seen, i] = take_pixels(reader, len(seen), keyframe)
+        pixels[seen, i] = take_pixels(reader, points[seen], keyframe)
     return head.map_with(points, pixels)
 
 
-def _take_points(reader: Reader, n: int) -> Integers:
-    return np.stack([take_column(reader, n) for _ in range(3)], axis=1)
+def _stacked(take: Callable[[Reader, int], Integers], reader: Reader, n: int) -> Integers:
+    return np.stack([take(reader, n) for _ in range(3)], axis=1)
 
 
 def _mask(rows: Rows, n: int) -> NDArray[np.bool_]:
