@@ -38,7 +38,7 @@ class Pose:
     def __post_init__(self) -> None:
         for name, shape in (("rotation", (3, 3)), ("translation", (3,))):
             value = np.array(getattr(self, name), dtype=np.float64)
-            if value.shape != shape or not np.all(np.isfinite(value)):
+            if value.shape != shape or not np.isfinite(value).all():
                 raise ValueError(f"Pose.{name} must be finite with shape {shape}: {value}")
             value.flags.writeable = False
             object.__setattr__(self, name, value)
@@ -77,8 +77,8 @@ class Pose:
 
     def matrix(self) -> Array:
         """Return the (4, 4) homogeneous matrix."""
-        out = np.eye(4)
-        out[:3, :3], out[:3, 3] = self.rotation, self.translation
+        out = np.zeros((4, 4))
+        out[:3, :3], out[:3, 3], out[3, 3] = self.rotation, self.translation, 1.0
         return out
 
     def retracted(self, delta: Array) -> Pose:

@@ -38,6 +38,7 @@ SIDE = 2 * HALF + 1
 _SMOOTHED = 4.0 / 9.0
 # Where a patch's far side is so many times farther than its middle, it is edge on.
 _LEAST_DIVISOR = 0.5
+_LEAST_SHARE = 0.125
 # Why a patch was not found.
 FOUND, OUTSIDE, FLAT, UNLIKE, WANDERED, UNSETTLED = 0, 1, 2, 3, 4, 5
 
@@ -170,6 +171,11 @@ def warped(
     depth = min(max(math.log2(scale), 0.0), len(shelves) - 1.0)
     level = min(int(depth), len(shelves) - 2) if len(shelves) > 1 else 0
     share = depth - level
+    # A little of another level is no other patch, and takes as long as half of it.
+    if share < _LEAST_SHARE:
+        share = 0.0
+    elif share > 1.0 - _LEAST_SHARE:
+        level, share = level + 1, 0.0
     n_levels = 2 if share > 0.0 else 1
     reach = HALF + 1
     e, f = back[4], back[5]
