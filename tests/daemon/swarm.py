@@ -103,8 +103,9 @@ class Drone:
             rng,
         )  # fmt: skip
         self._link = PeerLink(
-            peers, system_id, frozenset(members), self._hear, self.exchange.on_heartbeat
-        )
+            peers, system_id, frozenset(members), self._hear, self.exchange.on_heartbeat,
+            clock, self.exchange.on_time,
+        )  # fmt: skip
         self.exchange.attach(self._link)
 
     async def run(self) -> None:
@@ -211,11 +212,18 @@ class Flyer(Drone):
 
 
 class Stranger:
-    """A member of the swarm that says what a test wants it to."""
+    """A member of the swarm that says what a test wants it to.
+
+    It keeps its time to itself until its ``clock`` is told one.
+    """
 
     def __init__(self, system_id: int, members: tuple[int, ...], peers: PeerOptions) -> None:
         self.system_id = system_id
-        self._link = PeerLink(peers, system_id, frozenset(members), self._hear, lambda _: None)
+        self.clock = ManualClock()
+        self._link = PeerLink(
+            peers, system_id, frozenset(members), self._hear, lambda _: None,
+            self.clock, lambda *_: None,
+        )  # fmt: skip
         self.forget()
         self.messages: asyncio.Queue[Message] = asyncio.Queue()
         self.blobs: asyncio.Queue[BlobReceived] = asyncio.Queue()

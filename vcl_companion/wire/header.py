@@ -11,7 +11,7 @@ from enum import IntEnum
 
 from vcl_companion.errors import WireError
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 MAX_PAYLOAD_BYTES = 128  # of one MAVLink TUNNEL
 MAX_BLOB_BYTES = 8 * 1024 * 1024
 
