@@ -31,6 +31,7 @@ from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.counters import LinkCounters
 from vcl_companion.links.mavlink import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions
 from vcl_companion.localization.intra import LocalizationOptions, Localized
@@ -104,7 +105,7 @@ class Drone:
         )  # fmt: skip
         self._link = PeerLink(
             peers, system_id, frozenset(members), self._hear, self.exchange.on_heartbeat,
-            clock, self.exchange.on_time,
+            clock, self.exchange.clocks.answered,
         )  # fmt: skip
         self.exchange.attach(self._link)
 
@@ -144,6 +145,11 @@ class Drone:
         self.autopilot.measure(frame.captured_at_ns, taken.quaternion())
         assert await self.autopilot_link.attitude_at(frame.captured_at_ns, 5.0) is not None
         self.exchange.on_frame(frame)
+
+    @property
+    def link_counters(self) -> LinkCounters:
+        """What went to and from its peers so far."""
+        return self._link.counters
 
     @property
     def revision(self) -> bytes:

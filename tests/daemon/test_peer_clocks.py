@@ -226,6 +226,52 @@ def test_who_is_alive_is_asked_quickly_at_first_and_then_rarely(
     run(scenario())
 
 
+def test_who_answers_ever_another_time_is_asked_rarely_too() -> None:
+    async def scenario() -> None:
+        clock = ManualClock(50 * SECOND)
+        group = Group(SwarmOptions((1, 2)), 1)
+        asked: list[int] = []
+        refused: list[str] = []
+        clocks = PeerClocks(
+            group, lambda ts1, _: asked.append(ts1), clock, FlightLog("", clock),
+            lambda _peer, _kind, why: refused.append(why), 0,
+        )  # fmt: skip
+        async with beside(clocks.run()):
+            n_answered = 0
+            for _ in range(80):
+                for _ in group.heartbeat(2, now_s()):
+                    clocks.joined(2)
+                await passes(0.5)
+                for ts1_ns in asked[n_answered:]:
+                    n_answered += 1
+                    clocks.answered(2, ts1_ns, n_answered**2 * 1000 * SECOND)
+        assert len(refused) > 5
+        assert len(asked) <= 9 + 40 / 8
+        assert clocks.instant(2, 5, 0.0, 9).bound_ns is None
+
+    run(scenario())
+
+
+def test_a_group_at_rest_says_little(tmp_path: Path) -> None:
+    """Signs of life, states and time, to two peers each and signed, below 200 B/s a drone."""
+
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            drones = [await members.start(k, flies_on=MAP) for k in (1, 2, 3)]
+            await knows_of_time(*drones)
+            await passes(12.0)
+            before = [drone.link_counters for drone in drones]
+            await passes(40.0)
+            for drone, then in zip(drones, before, strict=True):
+                now = drone.link_counters
+                n_frames = now.messages_out - then.messages_out
+                # At most: signs of life and states are one frame each that goes to both.
+                signed = now.bytes_out - then.bytes_out + 13 * 2 * n_frames
+                assert 60.0 < signed / 40.0 < 200.0
+
+    run(scenario())
+
+
 def test_who_never_answers_is_asked_rarely() -> None:
     async def scenario() -> None:
         clock = ManualClock(50 * SECOND)

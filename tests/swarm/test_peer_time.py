@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,15 +19,20 @@ MS = 1_000_000
 
 @dataclass
 class Peer:
-    """A clock that was started at another time, and drifts; ``drift`` of ours beside it."""
+    """A clock that was started at another time, and drifts, ``drift`` of ours beside it.
+
+    The drift swings by ``swing`` to either side within six minutes.
+    """
 
     offset_ns: int
     drift: float = 0.0
     time: PeerTime = field(default_factory=PeerTime)
+    swing: float = 0.0
 
     def true_offset_ns(self, at_ns: int) -> float:
         """Our clock minus the peer's, at an instant of ours."""
-        return self.offset_ns + self.drift * at_ns
+        swung_ns = self.swing * 60 * SECOND * (1 - math.cos(at_ns / (60 * SECOND)))
+        return self.offset_ns + self.drift * at_ns + swung_ns
 
     def reads(self, at_ns: int) -> int:
         """What the peer's clock shows at an instant of ours."""
@@ -73,6 +79,15 @@ def test_an_even_line_gives_the_offset_and_then_the_drift() -> None:
     assert last.bound_ns < later.bound_ns < 3 * MS
 
 
+def test_a_drift_that_changes_with_the_temperature_stays_within_the_bound() -> None:
+    peer = Peer(-9 * SECOND, 30e-6, swing=4e-6)
+    for k in range(100):
+        assert peer.exchange((10 + 8 * k) * SECOND, 5000, 5000) is None
+        for later_s in (0, 4, 8):
+            known = peer.assert_within_bound((10 + 8 * k + later_s) * SECOND)
+    assert known.bound_ns < MS / 2
+
+
 @dataclass(frozen=True)
 class Line:
     """A link: fixed ways, jitter on top, and what it does to datagrams; times in seconds."""
@@ -107,13 +122,9 @@ def test_the_truth_lies_within_the_bound(
 ) -> None:
     """Whatever is delayed, overtaken, lost or doubled; the drift itself changes a little."""
     rng = np.random.default_rng(seed)
-    time = PeerTime()
+    peer = Peer(offset_ns, drift, swing=wander)
+    time = peer.time
     start_ns = 1000 * SECOND
-
-    def true_offset_ns(at_ns: int) -> float:
-        since_ns = at_ns - start_ns
-        swing_ns = wander * 60 * SECOND * (1 - np.cos(since_ns / (60 * SECOND)))
-        return offset_ns + drift * since_ns + float(swing_ns)
 
     def way_ns(fixed_s: float) -> int:
         return round((fixed_s + rng.exponential(line.jitter_s)) * SECOND)
@@ -130,13 +141,13 @@ def test_the_truth_lies_within_the_bound(
             relation = time.relation(at_ns)
             if relation is not None:
                 n_known += 1
-                assert abs(relation.offset_ns - true_offset_ns(at_ns)) <= relation.bound_ns
+                peer.assert_within_bound(at_ns)
                 assert abs(relation.drift - drift) <= relation.drift_bound + 2 * abs(wander)
         ts1_ns = time.ask(now_ns)
         if rng.uniform() < line.loss:
             continue
         there_ns = now_ns + way_ns(line.there_s)
-        tc1_ns = round(there_ns - true_offset_ns(there_ns))
+        tc1_ns = peer.reads(there_ns)
         if tc1_ns <= 0:
             continue  # a peer whose clock has not begun says nothing
         for _ in range(1 + (rng.uniform() < line.twice)):

@@ -208,7 +208,7 @@ async def _run(config: Config) -> int:
         exchange.on_tunnel,
         exchange.on_heartbeat,
         clock,
-        exchange.on_time,
+        exchange.clocks.answered,
     )
     exchange.attach(peers)
     began_at_s, began_cpu_s = time.monotonic(), cpu_s()

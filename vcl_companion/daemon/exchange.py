@@ -124,7 +124,7 @@ class Exchange:
         self._options = options
         self._link: PeerLink | None = None
         self._refusals = Refusals(log)
-        self._clocks = PeerClocks(
+        self.clocks = PeerClocks(
             group, self._ask_time, clock, log, self._refusals.count, options.clock_resolution_ns
         )
         self._frames = FrameHistory()
@@ -141,7 +141,7 @@ class Exchange:
             estimator,
             sensor,
             clock,
-            self._clocks,
+            self.clocks,
             log,
             work,
             partial(self._hand, BlobKind.FRAME_ANSWER),
@@ -160,7 +160,7 @@ class Exchange:
             lambda: transfers.is_receiving(BlobKind.MAP, self._now_s()),
             log,
             clock,
-            self._clocks,
+            self.clocks,
             work,
             RoundOptions(options.map, options.update),
             rng,
@@ -197,7 +197,7 @@ class Exchange:
             self._send,
             self._refusals.count,
             clock,
-            self._clocks,
+            self.clocks,
             work,
             options.inter.detector,
             options.detectors,
@@ -213,7 +213,7 @@ class Exchange:
         return self._refusals.by_kind
 
     def attach(self, link: PeerLink) -> None:
-        """Give the link to speak on; it calls ``on_tunnel``, ``on_heartbeat`` and ``on_time``."""
+        """Give the link to speak on; it calls what begins with ``on``, and ``clocks``."""
         self._link = link
 
     def on_frame(self, frame: Frame) -> None:
@@ -223,10 +223,6 @@ class Exchange:
     def on_heartbeat(self, peer: int) -> None:
         """Note a sign of life."""
         self._note(self._group.heartbeat(peer, self._now_s()))
-
-    def on_time(self, peer: int, ts1_ns: int, tc1_ns: int) -> None:
-        """Take a peer's answer about its time."""
-        self._clocks.answered(peer, ts1_ns, tc1_ns)
 
     def on_tunnel(self, tunnel: Tunnel) -> None:
         """Take one payload of a peer; whatever is wrong with it is counted, never raised."""
@@ -243,7 +239,7 @@ class Exchange:
     async def run(self) -> None:
         """Keep transfers, states and rounds going until cancelled; a failure in one ends all."""
         async with asyncio.TaskGroup() as parts:
-            parts.create_task(self._clocks.run())
+            parts.create_task(self.clocks.run())
             parts.create_task(self._rounds.run())
             parts.create_task(self._answers.run())
             parts.create_task(self._passed.run())
@@ -409,7 +405,7 @@ class Exchange:
             _log.info("drone %d %s", event.peer, "joined" if joined else "is silent")
             if joined:
                 self._forgot(event.peer)
-                self._clocks.joined(event.peer)
+                self.clocks.joined(event.peer)
                 self._tell_state()
             else:
                 self._passed.forgot(event.peer)

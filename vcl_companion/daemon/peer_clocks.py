@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -19,8 +20,8 @@ _SLOW_S = 8.0
 # Question and answer are 43 bytes each when signed: of many peers fewer are asked at a time, so
 # that all of it stays below 90 B/s.
 _LEAST_BETWEEN_S = 1.0
-# Who has left so many unanswered is asked rarely, for ever.
-_HOPELESS = 8
+# Who has been asked so many without a relation that holds is asked rarely from then on.
+_MOST_QUICK = 8
 _LOG_EVERY_S = 5.0
 _LONGEST_PAUSE_S = 0.5
 
@@ -53,6 +54,7 @@ class PeerClocks:
         self._refuse = refuse
         self._times = {peer: PeerTime(resolution_ns) for peer in group.peers}
         self._asked_at_s: dict[int, float] = {}
+        self._n_quick: Counter[int] = Counter()
         self._logged_at_s: dict[int, float] = {}
         self._wake = asyncio.Event()
 
@@ -60,6 +62,7 @@ class PeerClocks:
         """Note that a peer is there, or back: it may have been restarted."""
         self._times[peer].rejoined()
         self._asked_at_s.pop(peer, None)
+        self._n_quick[peer] = 0
         self._logged_at_s.pop(peer, None)
         self._wake.set()
 
@@ -90,16 +93,20 @@ class PeerClocks:
             if self._clock.now_ns() > 0:
                 for peer in self._group.alive:
                     if peer in self._times and self._is_due(peer):
-                        self._asked_at_s[peer] = self._now_s()
-                        self._ask(self._times[peer].ask(self._clock.now_ns()), peer)
+                        self._ask_for_time(peer)
             self._wake.clear()
             with suppress(TimeoutError):
                 async with asyncio.timeout(_LONGEST_PAUSE_S):
                     await self._wake.wait()
 
-    def _is_due(self, peer: int) -> bool:
+    def _ask_for_time(self, peer: int) -> None:
         time = self._times[peer]
-        is_rare = time.is_settled or time.unanswered >= _HOPELESS
+        self._asked_at_s[peer] = self._now_s()
+        self._n_quick[peer] = 0 if time.is_settled else self._n_quick[peer] + 1
+        self._ask(time.ask(self._clock.now_ns()), peer)
+
+    def _is_due(self, peer: int) -> bool:
+        is_rare = self._times[peer].is_settled or self._n_quick[peer] >= _MOST_QUICK
         every_s = max(_SLOW_S, _LEAST_BETWEEN_S * len(self._times)) if is_rare else _QUICK_S
         # A turn comes a little early or late: due is what the next one would be too late for.
         since_s = self._now_s() - self._asked_at_s.get(peer, float("-inf"))

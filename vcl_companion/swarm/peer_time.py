@@ -157,11 +157,6 @@ class PeerTime:
         """How many clocks the peer has had so far."""
 
     @property
-    def unanswered(self) -> int:
-        """How many questions in a row got no answer."""
-        return self._questions.unanswered
-
-    @property
     def is_settled(self) -> bool:
         """Whether it is enough to ask now and then."""
         return self._is_trusted and len(self._exchanges) >= _SETTLED
@@ -194,7 +189,6 @@ class PeerTime:
 
     def rejoined(self) -> None:
         """Note that the peer was away: it may have another clock now, until it answers."""
-        self._questions.begin_anew()
         self._is_confirmed = False
 
     def relation(self, at_ns: int) -> ClockRelation | None:

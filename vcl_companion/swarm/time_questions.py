@@ -85,7 +85,3 @@ class TimeQuestions:
     def forget(self) -> None:
         """Wait for no answer any more: the other has started anew."""
         self._outstanding.clear()
-
-    def begin_anew(self) -> None:
-        """Count unanswered questions from here: the other may answer again."""
-        self._unanswered = 0
