@@ -74,6 +74,21 @@ class MapRow(msgspec.Struct, frozen=True):
     parent: str = ""
 
 
+class ClockRow(msgspec.Struct, frozen=True):
+    """How a peer's clock went beside ours, and how well that was known.
+
+    ``offset_ns`` is our clock minus the peer's at ``at_ns`` of ours; the truth is no
+    further off than the bounds.
+    """
+
+    at_ns: int
+    peer: int
+    offset_ns: int
+    bound_ns: int
+    drift_ppm: float
+    drift_bound_ppm: float
+
+
 class SummaryRow(msgspec.Struct, frozen=True):
     """What a daemon says of itself at its end; ``resident_mb`` is its peak."""
 
@@ -95,6 +110,7 @@ class FlightLog:
     events: tuple[EventRow, ...]
     maps: tuple[MapRow, ...]
     summary: SummaryRow | None
+    clocks: tuple[ClockRow, ...] = ()
 
     def count(self, outcome: str) -> int:
         """Return how many frames had an outcome."""
@@ -120,6 +136,7 @@ def read_flight_log(path: Path) -> FlightLog:
     estimates: list[EstimateRow] = []
     events: list[EventRow] = []
     maps: list[MapRow] = []
+    clocks: list[ClockRow] = []
     summary: SummaryRow | None = None
     for row, line in _json_lines(path):
         match line.get("kind"):
@@ -131,11 +148,15 @@ def read_flight_log(path: Path) -> FlightLog:
                 events.append(_converted(line, EventRow, path, row))
             case "map":
                 maps.append(_converted(line, MapRow, path, row))
+            case "clock":
+                clocks.append(_converted(line, ClockRow, path, row))
             case "summary":
                 summary = _converted(line, SummaryRow, path, row)
     # A frame that asks peers about itself is answered after younger ones.
     frames.sort(key=lambda frame: frame.sequence)
-    return FlightLog(tuple(frames), tuple(estimates), tuple(events), tuple(maps), summary)
+    return FlightLog(
+        tuple(frames), tuple(estimates), tuple(events), tuple(maps), summary, tuple(clocks)
+    )
 
 
 def estimates_of(rows: Iterable[EstimateRow]) -> Estimates:

@@ -31,6 +31,7 @@ from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.counters import LinkCounters
 from vcl_companion.links.mavlink import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions
 from vcl_companion.localization.intra import LocalizationOptions, Localized
@@ -103,8 +104,9 @@ class Drone:
             rng,
         )  # fmt: skip
         self._link = PeerLink(
-            peers, system_id, frozenset(members), self._hear, self.exchange.on_heartbeat
-        )
+            peers, system_id, frozenset(members), self._hear, self.exchange.on_heartbeat,
+            clock, self.exchange.clocks.answered,
+        )  # fmt: skip
         self.exchange.attach(self._link)
 
     async def run(self) -> None:
@@ -143,6 +145,11 @@ class Drone:
         self.autopilot.measure(frame.captured_at_ns, taken.quaternion())
         assert await self.autopilot_link.attitude_at(frame.captured_at_ns, 5.0) is not None
         self.exchange.on_frame(frame)
+
+    @property
+    def link_counters(self) -> LinkCounters:
+        """What went to and from its peers so far."""
+        return self._link.counters
 
     @property
     def revision(self) -> bytes:
@@ -211,11 +218,18 @@ class Flyer(Drone):
 
 
 class Stranger:
-    """A member of the swarm that says what a test wants it to."""
+    """A member of the swarm that says what a test wants it to.
+
+    It keeps its time to itself until its ``clock`` is told one.
+    """
 
     def __init__(self, system_id: int, members: tuple[int, ...], peers: PeerOptions) -> None:
         self.system_id = system_id
-        self._link = PeerLink(peers, system_id, frozenset(members), self._hear, lambda _: None)
+        self.clock = ManualClock()
+        self._link = PeerLink(
+            peers, system_id, frozenset(members), self._hear, lambda _: None,
+            self.clock, lambda *_: None,
+        )  # fmt: skip
         self.forget()
         self.messages: asyncio.Queue[Message] = asyncio.Queue()
         self.blobs: asyncio.Queue[BlobReceived] = asyncio.Queue()

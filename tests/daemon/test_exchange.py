@@ -17,6 +17,7 @@ from tests.wire.samples import small_map
 from vcl_companion.cameras.source import Frame
 from vcl_companion.swarm.transfer import BlobKind, TransferOptions
 from vcl_companion.wire.frame_codec import encode_frame
+from vcl_companion.wire.header import PROTOCOL_VERSION
 from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
 from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
 from vcl_companion.wire.tunnel import encode_payload
@@ -38,7 +39,7 @@ def asked_more(drone: Drone) -> Callable[[], bool]:
 
 async def one_thing_later(stranger: Stranger, system_id: int, number: int) -> None:
     """Wait until a drone has done what it was doing beside its event loop: that goes in turn."""
-    stranger.say(FrameRequest(number, 0.0), system_id)
+    stranger.say(FrameRequest(number, 0, 0.0), system_id)
     assert (await stranger.answer())[1].request_id == number
 
 
@@ -203,23 +204,23 @@ def test_a_request_repeated_gets_the_very_same_bytes(tmp_path: Path) -> None:
         async with swarm(1, 2, path=tmp_path) as members:
             two, one = await members.start(2), await members.stranger(1)
             await one.meets(2)
-            one.say(FrameRequest(5, 0.0), 2)  # it has no frame yet: silence
+            one.say(FrameRequest(5, 0, 0.0), 2)  # it has no frame yet: silence
             await two.see(demo.frame(2))
-            one.say(FrameRequest(6, 0.0), 2)
+            one.say(FrameRequest(6, 0, 0.0), 2)
             blob, answer = await one.answer()
             assert (answer.drone_id, answer.request_id) == (2, 6)
             assert answer.captured_at_ns == demo.shot(2).at_ns
             assert answer.ned_from_body is not None
             await two.see(later(2, demo.frame(2)))
             one.forget()
-            one.say(FrameRequest(6, 0.0), 2)
+            one.say(FrameRequest(6, 0, 0.0), 2)
             assert (await one.answer())[0] == blob
-            one.say(FrameRequest(7, 0.0), 2)
+            one.say(FrameRequest(7, 0, 0.0), 2)
             newer_blob, newer = await one.answer()
             assert newer_blob != blob
             assert newer.request_id == 7
             assert newer.captured_at_ns == demo.shot(2).at_ns + 100_000_000
-            one.say(FrameRequest(8, 0.1), 2)
+            one.say(FrameRequest(8, 0, 0.1), 2)
             assert (await one.answer())[1].captured_at_ns == demo.shot(2).at_ns
             assert one.blobs.empty()
 
@@ -235,7 +236,7 @@ def test_a_frame_that_is_no_more_wanted_is_not_sent_to_its_end(tmp_path: Path) -
             await two.see(demo.frame(2))
             for request_id in range(20, 24):
                 arrived = asked_more(two)
-                one.say(FrameRequest(request_id, 0.0), 2)
+                one.say(FrameRequest(request_id, 0, 0.0), 2)
                 await until(arrived)
             assert (await one.answer())[1].request_id == 23
             assert one.blobs.empty()
@@ -252,13 +253,13 @@ def test_a_flood_of_requests_piles_nothing_up(tmp_path: Path) -> None:
             n_tasks = len(asyncio.all_tasks())
             for request_id in range(5000):
                 two.exchange.on_tunnel(
-                    said(1 + 2 * (request_id % 2), FrameRequest(request_id, 0.0))
+                    said(1 + 2 * (request_id % 2), FrameRequest(request_id, 0, 0.0))
                 )
             await asyncio.sleep(0)
             assert len(asyncio.all_tasks()) <= n_tasks + 2
             # Each peer's last one is answered.
             assert (await one.answer())[1].request_id == 4998
-            one.say(FrameRequest(6000, 0.0), 2)
+            one.say(FrameRequest(6000, 0, 0.0), 2)
             assert (await one.answer())[1].request_id == 6000
             assert one.blobs.empty()
 
@@ -330,7 +331,7 @@ def test_maps_and_frames_that_are_none_are_counted_and_harm_nothing(tmp_path: Pa
             two, one = await members.start(2), await members.stranger(1)
             await one.meets(2)
             bad_maps = (
-                b"\x01\x42 no map",
+                b"\x02\x42 no map",
                 PAIR[:-1],
                 encode_map(small_map()),  # well formed, but its images are none
                 encode_frame(demo.answer(1)),
@@ -338,7 +339,7 @@ def test_maps_and_frames_that_are_none_are_counted_and_harm_nothing(tmp_path: Pa
             for n, blob in enumerate(bad_maps, start=1):
                 one.hand(BlobKind.MAP, blob, 2)
                 await until(counted(two, "map", n))
-            for n, blob in enumerate((b"", b"\x01\x41", PAIR), start=1):
+            for n, blob in enumerate((b"", b"\x02\x41", PAIR), start=1):
                 one.hand(BlobKind.FRAME_ANSWER, blob, 2)
                 await until(counted(two, "frame", n))
             assert two.revision == b""
@@ -355,7 +356,7 @@ def test_garbage_is_counted_by_kind_and_logged_once(tmp_path: Path) -> None:
         async with swarm(1, 2, path=tmp_path) as members:
             two, one = await members.start(2), await members.stranger(1)
             await one.meets(2)
-            head, body = encode_payload(FrameRequest(0, 0.0))[1][:2], bytes(4)
+            head, body = encode_payload(FrameRequest(0, 0, 0.0))[1][:2], bytes(12)
             for k in range(1, 51):  # ages of no frame, each another message
                 one.say_bytes(MESSAGE, head + body + k.to_bytes(7, "little") + b"\xff", 2)
             one.say_bytes(40_000, b"not for us at all", 2)
@@ -372,7 +373,7 @@ def test_garbage_is_counted_by_kind_and_logged_once(tmp_path: Path) -> None:
 payloads = st.one_of(
     st.binary(max_size=128),
     st.builds(
-        lambda kind, body: bytes([1, kind]) + body,
+        lambda kind, body: bytes([PROTOCOL_VERSION, kind]) + body,
         st.integers(0, 8),
         st.binary(max_size=126),
     ),

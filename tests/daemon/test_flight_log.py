@@ -16,6 +16,7 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import matrix_from_euler
+from vcl_companion.swarm.peer_time import ClockRelation
 
 SUMMARY = {
     "cpu_s": 1.5,
@@ -47,6 +48,7 @@ def test_lines_are_as_specified(tmp_path: Path) -> None:
     clock.advance_to(42)
     log.event("lost", "fog \u2601")
     log.map(bytes(range(8)), b"", 120, 4567, 3)
+    log.peer_clock(2, ClockRelation(42, -5_000_000_000, 1_500_000, 3e-6, 2e-6))
     before_the_end = lines(path)
     log.close(**SUMMARY)
     assert lines(path)[:-1] == before_the_end == [
@@ -65,6 +67,8 @@ def test_lines_are_as_specified(tmp_path: Path) -> None:
         {"kind": "event", "at_ns": 42, "event": "lost", "reason": "fog \u2601"},
         {"kind": "map", "at_ns": 42, "revision": "0001020304050607", "parent": "",
          "landmarks": 120, "bytes": 4567, "keyframes": 3},
+        {"kind": "clock", "at_ns": 42, "peer": 2, "offset_ns": -5_000_000_000,
+         "bound_ns": 1_500_000, "drift_ppm": 3.0, "drift_bound_ppm": 2.0},
     ]  # fmt: skip
     assert lines(path)[-1] == {
         "kind": "summary",
@@ -97,8 +101,12 @@ def test_the_report_reads_it(tmp_path: Path) -> None:
     path = tmp_path / "flight.jsonl"
     log = FlightLog(str(path), ManualClock())
     fill(log)
+    log.peer_clock(2, ClockRelation(42, -5_000_000_000, 1_500_000, 3e-6, 2e-6))
     log.close(**SUMMARY)
     read = read_flight_log(path)
+    (clock,) = read.clocks
+    assert (clock.peer, clock.offset_ns, clock.bound_ns) == (2, -5_000_000_000, 1_500_000)
+    assert (clock.drift_ppm, clock.drift_bound_ppm) == (3.0, 2.0)
     assert len(read.frames) == 4
     assert read.summary is not None
     assert read.summary.refusals == {"fog": 2}

@@ -14,7 +14,8 @@ from tests.checks import assert_pose_close
 from tests.daemon import demo
 from tests.daemon.flying import STARVED, Flier, flying
 from tests.daemon.swarm import INTER, Drone, Stranger, Swarm, swarm
-from tests.daemon.waiting import run, until
+from tests.daemon.waiting import passes, run, until
+from vcl_companion.daemon.estimator import HISTORY_S
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.swarm.transfer import BlobKind
@@ -189,6 +190,51 @@ def test_a_late_proposal_is_fused_at_its_own_time(tmp_path: Path) -> None:
     run(scenario())
 
 
+@pytest.mark.parametrize("is_heard_of", [True, False])
+def test_a_proposal_older_than_the_history_is_refused_and_the_log_says_why(
+    tmp_path: Path, is_heard_of: bool
+) -> None:
+    """Its frame is forgotten; and, later still, so is that it was asked for."""
+
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            drone, stranger = await asked_by(members, 2)
+            async with flying(drone, STARVED) as two:
+                two.give(0)
+                first = await request_of(stranger)
+                stranger.say(proposal(first, demo.world_from_body(2, 0)), 2)
+                await two.server.answered()
+                two.give(1)
+                second = await request_of(stranger)
+                for k in range(2, 30, 3):  # six seconds of flight
+                    two.give(k)
+                    await until(lambda k=k: len(two.sources()) == 1 + (k + 1) // 3)  # type: ignore[misc]
+                if not is_heard_of:
+                    await passes(PATIENT.wait_s)
+                    await two.server.answered()
+                    await passes(HISTORY_S + 0.5)
+                before = drone.estimator.predicted(demo.shot(2, 29).at_ns, None)
+                stranger.say(proposal(second, demo.world_from_body(2, 1)), 2)
+                if is_heard_of:
+                    await two.server.answered()
+                    line = drone.lines("estimate")[-1]
+                    assert line["captured_at_ns"] == demo.shot(2, 1).at_ns
+                    assert (line["host"], line["fused"]) == (1, False)
+                    assert line["reason"] == "no frame of 5.6 s ago is remembered"
+                else:
+                    late = "pose that comes too late to be fused"
+                    await until(lambda: drone.exchange.refused.get(late) == 1)
+                    assert drone.events("refused")[-1] == f"from drone 1: {late}"
+                after = drone.estimator.predicted(demo.shot(2, 29).at_ns, None)
+                assert before is not None
+                assert after is not None
+                assert_pose_close(
+                    after.world_from_body, before.world_from_body, within_m=1e-9, within_rad=1e-9
+                )
+
+    run(scenario())
+
+
 @pytest.mark.parametrize("answer", ["refused", "far off", "tilted"])
 def test_what_cannot_be_believed_leaves_the_frame_refused(tmp_path: Path, answer: str) -> None:
     async def scenario() -> None:
@@ -319,7 +365,7 @@ def test_hostile_requests_are_counted_or_refused_and_the_host_flies_on(
             async with flying(host) as one:
                 one.give(0)
                 await one.server.answered()
-                for blob in (b"", b"\x01\x43", b"\x01\x43" + bytes(300)):
+                for blob in (b"", b"\x02\x43", b"\x02\x43" + bytes(300)):
                     stranger.hand(BlobKind.POSE_REQUEST, blob, 1)
                 await until(lambda: host.exchange.refused.get("pose request", 0) >= 1)
                 # Of another drone than the one that asks.

@@ -102,8 +102,19 @@ def test_refusals_name_their_reason() -> None:
 def test_a_signed_frame_and_unknown_extensions_are_read() -> None:
     payload = wire.LAYOUT[wire.TIMESYNC].pack(0, 77)
     assert decoded(wire.frame(wire.TIMESYNC, payload, flags=1)) == Timesync(1, 1, 0, 77)
-    # Newer dialects append a target to TIMESYNC.
-    assert decoded(wire.frame(wire.TIMESYNC, payload + b"\x09\xc5")) == Timesync(1, 1, 0, 77)
+    # Newer dialects append a target to TIMESYNC; still newer ones may append more.
+    for more in (b"", b"\x01\x02"):
+        addressed = decoded(wire.frame(wire.TIMESYNC, payload + b"\x09\xc5" + more))
+        assert addressed == Timesync(1, 1, 0, 77, 9, 197)
+
+
+def test_a_time_for_one_companion_is_told_as_newer_dialects_do() -> None:
+    ours, _ = codec()
+    payload = wire.LAYOUT[wire.TIMESYNC].pack(2**62, -77) + b"\x09\xc5"
+    frame = wire.frame(wire.TIMESYNC, payload, component=197, sequence=0)
+    assert ours.timesync(2**62, -77, target_system=9) == frame
+    assert len(frame) == 30
+    assert decoded(ours.timesync(2**62, -77)) == Timesync(1, 197, 2**62, -77)
 
 
 def test_a_message_hidden_in_an_unknown_one_is_not_read() -> None:

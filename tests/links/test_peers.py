@@ -7,9 +7,11 @@ import pytest
 from tests.links import wire
 from tests.links.running import running, udp
 from tests.ports import free_ports
+from vcl_companion.clock import Clock, ManualClock, SystemClock
 from vcl_companion.errors import ConfigError
 from vcl_companion.links.mavlink import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions
+from vcl_companion.swarm.peer_time import PeerTime
 
 MEMBERS = frozenset({1, 2, 3})
 PAYLOAD_TYPE = 40000
@@ -18,12 +20,14 @@ PAYLOAD_TYPE = 40000
 class Drone:
     """A peer link and what it heard."""
 
-    def __init__(self, options: PeerOptions, system_id: int) -> None:
+    def __init__(self, options: PeerOptions, system_id: int, clock: Clock | None = None) -> None:
+        self.times: asyncio.Queue[tuple[int, int, int]] = asyncio.Queue()
         self.tunnels: asyncio.Queue[Tunnel] = asyncio.Queue()
         self.beats: asyncio.Queue[int] = asyncio.Queue()
         self.link = PeerLink(
-            options, system_id, MEMBERS, self.tunnels.put_nowait, self.beats.put_nowait
-        )
+            options, system_id, MEMBERS, self.tunnels.put_nowait, self.beats.put_nowait,
+            clock or ManualClock(), lambda *answer: self.times.put_nowait(answer),
+        )  # fmt: skip
 
     async def hears(self, *systems: int) -> None:
         missing = set(systems)
@@ -100,9 +104,91 @@ def test_strangers_and_nonsense_are_counted_and_not_heard() -> None:
                 "not a companion": 2,
                 "tunnel for another system": 1,
                 "tunnel length is a lie": 1,
-                "not a peer's message": 1,
+                "timesync for another": 1,
                 "truncated": 1,
             }
+
+    asyncio.run(scenario())
+
+
+class SkewedClock:
+    """The system's clock as another machine has it: begun at another time, going faster."""
+
+    def __init__(self, offset_ns: int, drift: float) -> None:
+        self.offset_ns, self.drift = offset_ns, drift
+        self._began_ns = SystemClock().now_ns()
+
+    def now_ns(self) -> int:
+        since_ns = SystemClock().now_ns() - self._began_ns
+        return self._began_ns + self.offset_ns + round(since_ns * (1.0 + self.drift))
+
+
+def test_two_links_relate_their_clocks_within_the_bound() -> None:
+    async def scenario() -> None:
+        ours, theirs = SystemClock(), SkewedClock(-123_456_789, 80e-6)
+        listen = [f"127.0.0.1:{port}" for port in free_ports(2)]
+        one = Drone(PeerOptions(listen[0], (listen[1],)), 1, ours)
+        two = Drone(PeerOptions(listen[1], (listen[0],)), 2, theirs)
+        async with running(one.link.run(), two.link.run()):
+            await one.hears(2)
+            time = PeerTime()
+            for _ in range(5):
+                one.link.ask_time(time.ask(ours.now_ns()), 2)
+                peer, ts1_ns, tc1_ns = await one.times.get()
+                assert peer == 2
+                assert time.answered(ts1_ns, tc1_ns, ours.now_ns()) is None
+                await asyncio.sleep(0.11)  # asked more often it does not answer
+            relation = time.relation(ours.now_ns())
+            assert relation is not None
+            before_ns = ours.now_ns()
+            apart_ns = before_ns - theirs.now_ns()
+            read_in_ns = ours.now_ns() - before_ns
+            assert abs(apart_ns - relation.offset_ns) <= relation.bound_ns + read_in_ns
+            assert relation.bound_ns < 50_000_000  # a busy machine's answer takes a while
+            assert one.link.counters.refused == two.link.counters.refused == {}
+
+    asyncio.run(scenario())
+
+
+def test_who_asks_for_the_time_all_the_time_is_answered_now_and_then() -> None:
+    async def scenario() -> None:
+        port, other = free_ports(2)
+        options = PeerOptions(f"127.0.0.1:{port}", (f"127.0.0.1:{other}",))
+        drone = Drone(options, 1, ManualClock(77))
+        async with udp(other) as side, running(drone.link.run()):
+            await side.got.get()
+            for ts1_ns in range(1, 51):
+                question = wire.LAYOUT[wire.TIMESYNC].pack(0, ts1_ns) + bytes([1, 197])
+                side.transport.sendto(
+                    wire.frame(wire.TIMESYNC, question, system=2, component=197),
+                    ("127.0.0.1", port),
+                )
+            side.transport.sendto(wire.heartbeat(2, 197), ("127.0.0.1", port))
+            await drone.hears(2)
+            n_answers = 50 - drone.link.counters.refused["asked for the time too often"]
+            # Fifty in a moment; more than the first only where the machine was busy meanwhile.
+            assert 1 <= n_answers < 25
+            answers: list[tuple[int, ...]] = []
+            while len(answers) < n_answers:
+                seen = wire.read((await side.got.get())[0])
+                answers += [s.fields for s in seen if s.message_id == wire.TIMESYNC]
+            assert answers[0] == (77, 1)
+
+    asyncio.run(scenario())
+
+
+def test_a_clock_that_was_not_told_the_time_tells_none() -> None:
+    async def scenario() -> None:
+        one, two, _ = unicast(3)
+        async with running(one.link.run(), two.link.run()):
+            await one.hears(2)
+            await two.hears(1)
+            one.link.ask_time(5, 2)
+            one.link.send(PAYLOAD_TYPE, b"after it", target_system=2)
+            assert (await two.tunnels.get()).payload == b"after it"
+            two.link.send(PAYLOAD_TYPE, b"and back", target_system=1)
+            assert (await one.tunnels.get()).payload == b"and back"
+            assert one.times.empty()
 
     asyncio.run(scenario())
 

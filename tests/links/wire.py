@@ -124,7 +124,8 @@ def read(data: bytes) -> list[Seen]:
         expected = crc(body + bytes([CRC_EXTRA[message_id]]))
         assert int.from_bytes(checksum, "little") == expected
         layout = LAYOUT[message_id]
-        payload = data[10 : 10 + n].ljust(layout.size, b"\0")
+        # Extension fields that are not in the layout are passed over.
+        payload = data[10 : 10 + n][: layout.size].ljust(layout.size, b"\0")
         out.append(Seen(data[4], data[5], data[6], message_id, layout.unpack(payload)))
         data = data[12 + n :]
     return out

@@ -49,6 +49,7 @@ statuses = st.one_of(
 )
 
 _request_ids = st.integers(0, (1 << 32) - 1)
+_instants = st.integers(-(1 << 63), (1 << 63) - 1)
 _revisions = st.one_of(st.just(b""), st.binary(min_size=8, max_size=8))
 
 
@@ -65,7 +66,7 @@ def proposals(draw: st.DrawFn) -> PoseProposal:
 
 
 messages = st.one_of(
-    st.builds(FrameRequest, _request_ids, st.floats(0.0, 3600.0)),
+    st.builds(FrameRequest, _request_ids, _instants, st.floats(0.0, 3600.0)),
     st.builds(
         MapState,
         _revisions,

@@ -170,7 +170,7 @@ def test_an_image_that_would_be_taken_for_a_reference_is_not_encoded(image: byte
         encode_map_update(encode_map(odd), PARENT)
 
 
-@given(st.binary(max_size=200), st.sampled_from([b"", b"\x01", b"\x01\x44"]))
+@given(st.binary(max_size=200), st.sampled_from([b"", b"\x02", b"\x02\x44"]))
 def test_any_bytes_are_a_wire_error(body: bytes, head: bytes) -> None:
     with pytest.raises(WireError):
         decode_map_update(head + body, PARENT, {})

@@ -29,7 +29,7 @@ _GOLDEN: dict[str, TunnelPayload] = {
     ),
     "status_complete": TransferStatus(0xCAFE, Reply.COMPLETE, 127, digest=bytes(range(8))),
     "status_busy": TransferStatus(0xCAFE, Reply.BUSY, 1),
-    "frame_request": FrameRequest(77, 0.125),
+    "frame_request": FrameRequest(77, 123_456_789_012, 0.125),
     "map_state": MapState(bytes(range(8)), 1000, True, 517, False),
     "map_state_wants_update": MapState(bytes(range(8)), 1000, False, 0, True),
     "map_state_none": MapState(b"", 0, False),
@@ -96,7 +96,7 @@ def test_another_version_is_recognised_whatever_follows(value: TunnelPayload, ve
 
 
 def test_foreign_payload_types_and_crossed_kinds_are_refused() -> None:
-    payload_type, payload = encode_payload(FrameRequest(1, 0.0))
+    payload_type, payload = encode_payload(FrameRequest(1, 0, 0.0))
     assert is_ours(payload_type)
     assert not is_ours(0)
     with pytest.raises(WireError, match="not ours"):
@@ -124,9 +124,11 @@ def test_any_text_makes_a_reason(text: str, request_id: int) -> None:
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: FrameRequest(1, float("nan")),
-        lambda: FrameRequest(1, -0.1),
-        lambda: FrameRequest(1 << 32, 0.0),
+        lambda: FrameRequest(1, 0, float("nan")),
+        lambda: FrameRequest(1, 0, -0.1),
+        lambda: FrameRequest(1 << 32, 0, 0.0),
+        lambda: FrameRequest(1, 1 << 63, 0.0),
+        lambda: FrameRequest(1, -(1 << 63) - 1, 0.0),
         lambda: MapState(b"123", 0, True),
         lambda: MapState(b"", 1 << 20, True),
         lambda: MapState(b"", 0, True, 1 << 16),

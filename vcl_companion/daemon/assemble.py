@@ -55,6 +55,9 @@ _log = logging.getLogger(__name__)
 _CLOSE_S = 3.0
 _SWITCH_S = 0.0005
 _N_READERS = 4
+# A clock that a stream tells the time moves in steps of 20 ms, and is told them late when
+# there is much to do.
+_TOLD_CLOCK_RESOLUTION_NS = 100_000_000
 _END_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
@@ -178,6 +181,7 @@ async def _run(config: Config) -> int:
             config.recognised_by(),
             config.inter,
             tracked,
+            _TOLD_CLOCK_RESOLUTION_NS if isinstance(clock, ManualClock) else 0,
         ),
         rng,
     )
@@ -203,6 +207,8 @@ async def _run(config: Config) -> int:
         frozenset(group.members),
         exchange.on_tunnel,
         exchange.on_heartbeat,
+        clock,
+        exchange.clocks.answered,
     )
     exchange.attach(peers)
     began_at_s, began_cpu_s = time.monotonic(), cpu_s()

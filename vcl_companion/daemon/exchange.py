@@ -30,6 +30,7 @@ from vcl_companion.daemon.map_sharing import MapSharing
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
+from vcl_companion.daemon.peer_clocks import PeerClocks
 from vcl_companion.daemon.refusals import Refusals
 from vcl_companion.errors import WireError
 from vcl_companion.links.autopilot import AutopilotLink
@@ -64,7 +65,10 @@ _STEP_S = 0.1
 
 @dataclass(frozen=True)
 class ExchangeOptions:
-    """What the exchange is tuned by; see each of them. ``tracked``: maps by their patches."""
+    """What the exchange is tuned by; see each of them. ``tracked``: maps by their patches.
+
+    ``clock_resolution_ns`` is that of the members' clocks (``PeerTime``).
+    """
 
     swarm: SwarmOptions
     map: MapOptions
@@ -72,6 +76,7 @@ class ExchangeOptions:
     detectors: tuple[Detector, ...]
     inter: InterMavOptions
     tracked: bool
+    clock_resolution_ns: int = 0
 
 
 class Exchange:
@@ -119,6 +124,9 @@ class Exchange:
         self._options = options
         self._link: PeerLink | None = None
         self._refusals = Refusals(log)
+        self.clocks = PeerClocks(
+            group, self._ask_time, clock, log, self._refusals.count, options.clock_resolution_ns
+        )
         self._frames = FrameHistory()
         self._passed = PassedFrames(
             group,
@@ -133,6 +141,7 @@ class Exchange:
             estimator,
             sensor,
             clock,
+            self.clocks,
             log,
             work,
             partial(self._hand, BlobKind.FRAME_ANSWER),
@@ -151,6 +160,7 @@ class Exchange:
             lambda: transfers.is_receiving(BlobKind.MAP, self._now_s()),
             log,
             clock,
+            self.clocks,
             work,
             RoundOptions(options.map, options.update),
             rng,
@@ -187,6 +197,7 @@ class Exchange:
             self._send,
             self._refusals.count,
             clock,
+            self.clocks,
             work,
             options.inter.detector,
             options.detectors,
@@ -202,7 +213,7 @@ class Exchange:
         return self._refusals.by_kind
 
     def attach(self, link: PeerLink) -> None:
-        """Give the link to speak on; the link calls ``on_tunnel`` and ``on_heartbeat``."""
+        """Give the link to speak on; it calls what begins with ``on``, and ``clocks``."""
         self._link = link
 
     def on_frame(self, frame: Frame) -> None:
@@ -228,6 +239,7 @@ class Exchange:
     async def run(self) -> None:
         """Keep transfers, states and rounds going until cancelled; a failure in one ends all."""
         async with asyncio.TaskGroup() as parts:
+            parts.create_task(self.clocks.run())
             parts.create_task(self._rounds.run())
             parts.create_task(self._answers.run())
             parts.create_task(self._passed.run())
@@ -268,8 +280,9 @@ class Exchange:
                 if peer == self._group.coordinator:
                     self._maps.refuse(message.reason)
             case PoseProposal() | PoseRefused():
-                if not self.inter.take(peer, message):
-                    self._refusals.count(peer, "pose nobody asked for")
+                refusal = self.inter.take(peer, message)
+                if refusal is not None:
+                    self._refusals.count(peer, refusal)
 
     def _take_events(self, events: list[Event]) -> None:
         for event in events:
@@ -298,8 +311,9 @@ class Exchange:
         except WireError as error:
             self._refusals.count(peer, "frame", str(error))
             return
-        if not self._rounds.take(peer, frame):
-            self._refusals.count(peer, "frame nobody asked for")
+        refusal = self._rounds.take(peer, frame)
+        if refusal is not None:
+            self._refusals.count(peer, refusal)
 
     def _take_passed(self, peer: int, blob: bytes) -> None:
         try:
@@ -380,6 +394,10 @@ class Exchange:
         if self._link is not None:
             self._link.send(*encode_payload(message), peer)
 
+    def _ask_time(self, ts1_ns: int, peer: int) -> None:
+        if self._link is not None:
+            self._link.ask_time(ts1_ns, peer)
+
     def _note(self, events: list[PeerJoined | PeerLost]) -> None:
         for event in events:
             joined = isinstance(event, PeerJoined)
@@ -387,6 +405,7 @@ class Exchange:
             _log.info("drone %d %s", event.peer, "joined" if joined else "is silent")
             if joined:
                 self._forgot(event.peer)
+                self.clocks.joined(event.peer)
                 self._tell_state()
             else:
                 self._passed.forgot(event.peer)

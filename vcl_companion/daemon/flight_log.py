@@ -17,6 +17,7 @@ from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.pose import Pose, euler_pose_covariance
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.intra import Recognised
+from vcl_companion.swarm.peer_time import ClockRelation
 
 _log = logging.getLogger(__name__)
 
@@ -141,6 +142,18 @@ class FlightLog:
             landmarks=n_landmarks,
             bytes=n_bytes,
             keyframes=n_keyframes,
+        )
+
+    def peer_clock(self, peer: int, relation: ClockRelation) -> None:
+        """Write how a peer's clock goes beside ours, and how well that is known."""
+        self._write(
+            kind="clock",
+            at_ns=relation.at_ns,
+            peer=peer,
+            offset_ns=relation.offset_ns,
+            bound_ns=relation.bound_ns,
+            drift_ppm=relation.drift * 1e6,
+            drift_bound_ppm=relation.drift_bound * 1e6,
         )
 
     def close(self, **summary: float) -> None:

@@ -16,9 +16,11 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.mailbox import PeerMailbox
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.peer_clocks import PeerClocks
 from vcl_companion.geometry.rotation import quaternion_from_matrix
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.recording.sensor import Sensor
+from vcl_companion.swarm.peer_time import Instant
 from vcl_companion.wire.frame_codec import FrameAnswer, encode_frame
 from vcl_companion.wire.messages import FrameRequest
 
@@ -35,15 +37,23 @@ class _Wanted:
     """What a peer asked for, in our time."""
 
     request_id: int
-    at_ns: int
+    instant: Instant
 
 
 @dataclass(frozen=True)
 class _Given:
-    """The last answer to a peer."""
+    """The last answer to a peer, and of which instant it was."""
 
-    request_id: int
+    wanted: _Wanted
     blob: bytes
+
+    def answers(self, wanted: _Wanted) -> bool:
+        """Whether a request, come again, is about the same frame as far as known.
+
+        One that was found by its age, before the clocks were related, is looked for again.
+        """
+        was_known, is_known = (w.instant.bound_ns is not None for w in (self.wanted, wanted))
+        return self.wanted.request_id == wanted.request_id and (was_known or not is_known)
 
 
 class FrameAnswers:
@@ -58,6 +68,7 @@ class FrameAnswers:
         estimator: for the pose that goes with it.
         sensor: of our camera.
         clock: time base of frames.
+        clocks: whose instants are when.
         log: told of a frame that cannot be sent.
         work: does the encoding.
         hand: sends an answer to a peer; returns the transfer's id.
@@ -74,6 +85,7 @@ class FrameAnswers:
         estimator: Estimator,
         sensor: Sensor,
         clock: Clock,
+        clocks: PeerClocks,
         log: FlightLog,
         work: MapWork,
         hand: Callable[[int, bytes], int],
@@ -87,6 +99,7 @@ class FrameAnswers:
         self._estimator = estimator
         self._sensor = sensor
         self._clock = clock
+        self._clocks = clocks
         self._log = log
         self._work = work
         self._hand = hand
@@ -99,8 +112,10 @@ class FrameAnswers:
 
     def want(self, peer: int, request: FrameRequest) -> None:
         """Take a peer's request; a newer one of the same peer replaces it."""
-        at_ns = self._clock.now_ns() - round(request.frame_age_s * 1e9)
-        self._wanted.put(peer, _Wanted(request.request_id, at_ns))
+        instant = self._clocks.instant(
+            peer, request.at_ns, request.frame_age_s, self._clock.now_ns()
+        )
+        self._wanted.put(peer, _Wanted(request.request_id, instant))
 
     async def run(self) -> None:
         """Answer until cancelled."""
@@ -128,16 +143,16 @@ class FrameAnswers:
             ValueError: the frame is larger than peers accept.
         """
         given = self._given.get(peer)
-        if given is not None and given.request_id == wanted.request_id:
+        if given is not None and given.answers(wanted):
             return given.blob
-        frame = self._frames.nearest(wanted.at_ns)
+        frame = self._frames.nearest(wanted.instant.at_ns)
         if frame is None:
             return None
         answer = await self.describe(frame, wanted.request_id)
         blob = encode_frame(answer)
         self._note_given(answer)
         self._given.pop(peer, None)
-        self._given[peer] = _Given(wanted.request_id, blob)
+        self._given[peer] = _Given(wanted, blob)
         if len(self._given) > _MAX_ASKERS:
             del self._given[next(iter(self._given))]
         return blob

@@ -14,7 +14,7 @@ _N_FRAMES = 24
 _SPARSE_SPACING_NS = 900_000_000
 _N_SPARSE = 10
 # A frame from further off shows another moment of the flight: no frame is better.
-_FURTHEST_NS = 1_000_000_000
+FURTHEST_NS = 1_000_000_000
 
 
 class FrameHistory:
@@ -46,7 +46,7 @@ class FrameHistory:
     def near(self, at_ns: int) -> list[Frame]:
         """Return the frames captured within a second of an instant, the nearest first."""
         frames = [*self._sparse, *self._kept, *([self._newest] if self._newest else [])]
-        near = (f for f in frames if abs(f.captured_at_ns - at_ns) <= _FURTHEST_NS)
+        near = (f for f in frames if abs(f.captured_at_ns - at_ns) <= FURTHEST_NS)
         return sorted(near, key=lambda f: abs(f.captured_at_ns - at_ns))
 
     def _thin_out(self, frame: Frame) -> None:

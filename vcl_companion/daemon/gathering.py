@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vcl_companion.clock import Clock
+from vcl_companion.daemon.frame_history import FURTHEST_NS
+from vcl_companion.daemon.peer_clocks import PeerClocks
 from vcl_companion.swarm.group import Group
 from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.messages import MAX_AGE_S, FrameRequest
@@ -36,6 +38,10 @@ class Wanted:
     spacing_s: float = 1.0
     timeout_s: float = 20.0
 
+    def instant_ns(self, n: int) -> int:
+        """Return the instant of a member's n-th frame, our clock."""
+        return self.at_ns - round(n * self.spacing_s * 1e9)
+
 
 @dataclass
 class _FromPeer:
@@ -53,6 +59,7 @@ class Gathering:
         group: whom to ask.
         ask: sends a request to a peer.
         clock: time base of frames.
+        clocks: whose instants are when.
         rng: numbers the requests, so that a restarted coordinator's are not
             taken for those of its earlier life.
     """
@@ -62,13 +69,16 @@ class Gathering:
         group: Group,
         ask: Callable[[FrameRequest, int], None],
         clock: Clock,
+        clocks: PeerClocks,
         rng: np.random.Generator,
     ) -> None:
         self._group = group
         self._ask = ask
         self._clock = clock
+        self._clocks = clocks
         self._first_id = int(rng.integers(1 << 32))
         self._peers: dict[int, _FromPeer] | None = None  # None between rounds
+        self._wanted: Wanted | None = None  # None until they are asked
         self._came = asyncio.Event()
 
     @property
@@ -76,22 +86,25 @@ class Gathering:
         """Of the round's first frames."""
         return self._first_id
 
-    def take(self, peer: int, frame: FrameAnswer) -> bool:
-        """Take a peer's frame; False when nobody asked for it."""
+    def take(self, peer: int, frame: FrameAnswer) -> str | None:
+        """Take a peer's frame; return why it is refused, if it is."""
         if self._peers is None or frame.drone_id != peer or peer not in self._peers:
-            return False
+            return "frame nobody asked for"
         sent = self._peers[peer]
         if frame.request_id != self._id_of(len(sent.frames)):
-            return False
+            return "frame nobody asked for"
+        if self._is_of_another_instant(peer, frame, len(sent.frames)):
+            return "frame of another instant than the one asked for"
         sent.frames.append(frame)
         sent.asked_at_s = sent.since_s = float("-inf")
         self._came.set()
-        return True
+        return None
 
     def begin(self) -> int:
         """Begin a round and return its request id; what is still open of the last one is not."""
         self._first_id = (self._first_id + _IDS_A_ROUND) % (1 << 32)
         self._peers = {}
+        self._wanted = None
         return self._first_id
 
     async def gather(self, wanted: Wanted, is_over: Callable[[], bool]) -> list[FrameAnswer]:
@@ -101,6 +114,7 @@ class Gathering:
             What has come, of each member the latest frame first.
         """
         assert self._peers is not None, "a round has not begun"
+        self._wanted = wanted
         with suppress(TimeoutError):
             async with asyncio.timeout(wanted.timeout_s):
                 while not is_over():
@@ -113,6 +127,21 @@ class Gathering:
         came = [frame for sent in self._peers.values() for frame in sent.frames]
         self._peers = None
         return came
+
+    def _is_of_another_instant(self, peer: int, frame: FrameAnswer, n: int) -> bool:
+        """Whether a frame is surely not the n-th one that was asked for.
+
+        A peer that did not know our clock yet may have been misled by the way that the
+        request took; it is asked again.
+        """
+        taken = self._clocks.instant(
+            peer, frame.captured_at_ns, frame.frame_age_s, self._clock.now_ns()
+        )
+        if self._wanted is None or taken.bound_ns is None:
+            return False
+        # The peer knew our clock no better than we know its.
+        off_ns = abs(taken.at_ns - self._wanted.instant_ns(n)) - 2 * taken.bound_ns
+        return off_ns > FURTHEST_NS
 
     def _is_open(self, member: int, wanted: Wanted) -> bool:
         """Whether something of a member is still to come."""
@@ -135,8 +164,9 @@ class Gathering:
             sent.since_s = now_s
         sent.asked_at_s = now_s
         n = len(sent.frames)
-        age_s = (self._clock.now_ns() - wanted.at_ns) * 1e-9 + n * wanted.spacing_s
-        self._ask(FrameRequest(self._id_of(n), min(max(age_s, 0.0), MAX_AGE_S)), peer)
+        at_ns = wanted.instant_ns(n)
+        age_s = min(max((self._clock.now_ns() - at_ns) * 1e-9, 0.0), MAX_AGE_S)
+        self._ask(FrameRequest(self._id_of(n), at_ns, age_s), peer)
 
     async def _news(self) -> None:
         """Wait until something has come, or it is time to look again."""

@@ -18,6 +18,7 @@ from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.mailbox import PeerMailbox
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.peer_clocks import PeerClocks
 from vcl_companion.errors import WireError
 from vcl_companion.localization.inter import NoProposal, Proposal
 from vcl_companion.localization.map_index import MapIndex
@@ -48,6 +49,7 @@ class InterHost:
         answer: sends a message to a peer.
         refuse: counts what a peer sent in vain: peer, kind, detail.
         clock: time base of frames.
+        clocks: whose instants are when.
         work: does the vision, beside our own frames'.
         detector: the paper's way finds peers by it.
         indexed_by: detectors that the daemon indexes its maps by, some only when asked to.
@@ -63,6 +65,7 @@ class InterHost:
         answer: Callable[[PoseProposal | PoseRefused, int], None],
         refuse: Callable[[int, str, str], None],
         clock: Clock,
+        clocks: PeerClocks,
         work: MapWork,
         detector: Detector,
         indexed_by: tuple[Detector, ...],
@@ -75,6 +78,7 @@ class InterHost:
         self._answer = answer
         self._refuse = refuse
         self._clock = clock
+        self._clocks = clocks
         self._work = work
         self._detector: Detector = detector
         self._is_made = detector in indexed_by
@@ -114,7 +118,11 @@ class InterHost:
         stored = self._maps.current
         if stored is None or stored.revision != request.revision:
             return NoProposal("the host flies on another map")
-        own = await self._own_near(came_at_ns - round(request.frame.frame_age_s * 1e9))
+        asked = request.frame
+        instant = self._clocks.instant(
+            asked.drone_id, asked.captured_at_ns, asked.frame_age_s, came_at_ns
+        )
+        own = await self._own_near(instant.at_ns)
         if own is None:
             return NoProposal("the host does not know where it was then")
         stored = await self._indexed(stored)

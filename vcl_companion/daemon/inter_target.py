@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -27,6 +28,9 @@ from vcl_companion.wire.pose_messages import (
 )
 
 _log = logging.getLogger(__name__)
+
+# Requests without an answer, with the host that owes it: to tell late answers from wrong ones.
+_N_GIVEN_UP = 64
 
 
 @dataclass(eq=False)
@@ -109,6 +113,7 @@ class InterTarget:
         self._was_in_vain = False
         self._is_open = False
         self._asked: dict[int, Asked] = {}
+        self._given_up: deque[tuple[int, int]] = deque(maxlen=_N_GIVEN_UP)
 
     def begin(
         self, frame: Frame, ned_from_body: Array | None, revision: bytes, sigma_m: float
@@ -187,22 +192,31 @@ class InterTarget:
             return asked.handed_over()
         finally:
             self._asked.pop(asked.request_id, None)
+            self._given_up.extend((asked.request_id, host) for host in sorted(asked.waiting))
 
-    def take(self, peer: int, answer: PoseProposal | PoseRefused) -> bool:
-        """Take a host's answer; False when it was not asked, or has answered before."""
+    def take(self, peer: int, answer: PoseProposal | PoseRefused) -> str | None:
+        """Take a host's answer.
+
+        Returns:
+            None, or why it is refused: the host was not asked, has answered before, or
+            took so long that our own history does not reach there any more.
+        """
         asked = self._asked.get(answer.request_id)
+        if asked is None and (answer.request_id, peer) in self._given_up:
+            self._given_up.remove((answer.request_id, peer))
+            return "pose that comes too late to be fused"
         if asked is None or peer not in asked.waiting:
-            return False
+            return "pose nobody asked for"
         if isinstance(answer, PoseProposal):
             if answer.revision != asked.revision:
-                return False
+                return "pose nobody asked for"
             asked.proposals.append((peer, answer))
             self._hosts.answered(peer, _sigma_m(answer), asked.frame.captured_at_ns)
         else:
             self._hosts.answered(peer, math.inf, asked.frame.captured_at_ns)
             _log.debug("drone %d proposes no pose: %s", peer, answer.reason)
         self._answered(asked, peer)
-        return True
+        return None
 
     def lost(self, peer: int) -> None:
         """Note that a peer will not answer: it is silent, or the request did not get there."""

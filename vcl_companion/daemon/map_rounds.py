@@ -23,6 +23,7 @@ from vcl_companion.daemon.gathering import Gathering, Wanted
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
+from vcl_companion.daemon.peer_clocks import PeerClocks
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.swarm.group import Group
@@ -70,6 +71,7 @@ class MapRounds:
         is_receiving_map: whether a peer's map has been coming in lately.
         log: told of every update that is begun.
         clock: time base of frames.
+        clocks: whose instants are when.
         work: does the building.
         options: of the steps.
         rng: numbers the requests.
@@ -87,6 +89,7 @@ class MapRounds:
         is_receiving_map: Callable[[], bool],
         log: FlightLog,
         clock: Clock,
+        clocks: PeerClocks,
         work: MapWork,
         options: RoundOptions,
         rng: np.random.Generator,
@@ -103,16 +106,16 @@ class MapRounds:
         self._clock = clock
         self._work = work
         self._options = options
-        self._gathering = Gathering(group, ask, clock, rng)
+        self._gathering = Gathering(group, ask, clock, clocks, rng)
         self._trigger = UpdateTrigger(options.update, group)
         self._claimed_since_s: float | None = None
 
-    def take(self, peer: int, frame: FrameAnswer) -> bool:
-        """Take a peer's frame; False when nobody asked for it."""
-        is_asked = self._gathering.take(peer, frame)
-        if is_asked and self._is_updating:
+    def take(self, peer: int, frame: FrameAnswer) -> str | None:
+        """Take a peer's frame; return why it is refused, if it is."""
+        refusal = self._gathering.take(peer, frame)
+        if refusal is None and self._is_updating:
             self._passed.pass_on(frame)
-        return is_asked
+        return refusal
 
     async def run(self) -> None:
         """Make rounds until cancelled; each needs a frame that was not tried before."""
@@ -256,7 +259,7 @@ class MapRounds:
         """Return our own frames and those of the others, or why ours cannot be used."""
         own = [newest]
         for n in range(1, 1 + wanted.earlier.get(self._group.own_id, 0)):
-            earlier = self._frames.nearest(wanted.at_ns - round(n * wanted.spacing_s * 1e9))
+            earlier = self._frames.nearest(wanted.instant_ns(n))
             if earlier is not None:
                 own.append(earlier)
         try:

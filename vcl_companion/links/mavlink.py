@@ -20,6 +20,7 @@ of ArduPilot that ``common`` has not.
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -42,7 +43,15 @@ _MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
 _OVERHEAD_1, _OVERHEAD_2 = 8, 12
 _SIGNED = 0x01
 _SIGNATURE_BYTES = 13
+_HEAD_2 = 10
 _QUATERNION_NORM_TOLERANCE = 0.05
+
+# TIMESYNC with the extension fields that pymavlink's layout ends before
+# | 0  | i64 | tc1                                                    |
+# | 8  | i64 | ts1                                                    |
+# | 16 | u8  | target system: of who is asked, or has asked; 0 for any |
+# | 17 | u8  | its component                                          |
+_TIMESYNC = struct.Struct("<qqBB")
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,10 +95,15 @@ class AttitudeSample(Message):
 
 @dataclass(frozen=True)
 class Timesync(Message):
-    """A question (``tc1_ns`` 0) or the answer to the one that was asked at ``ts1_ns``."""
+    """A question (``tc1_ns`` 0) or the answer to the one that was asked at ``ts1_ns``.
+
+    ``target_system`` and ``target_component`` 0 are everybody.
+    """
 
     tc1_ns: int
     ts1_ns: int
+    target_system: int = 0
+    target_component: int = 0
 
 
 @dataclass(frozen=True)
@@ -239,8 +253,10 @@ class Codec:
             )
         )
 
-    def timesync(self, tc1_ns: int, ts1_ns: int) -> bytes:
-        """Return a TIMESYNC, a question when ``tc1_ns`` is 0."""
+    def timesync(self, tc1_ns: int, ts1_ns: int, target_system: int = 0) -> bytes:
+        """Return a TIMESYNC, a question when ``tc1_ns`` is 0; to another companion, or to any."""
+        if target_system:
+            return self._pack(_AddressedTimesync(tc1_ns, ts1_ns, target_system))
         return self._pack(dialect.MAVLink_timesync_message(tc1_ns, ts1_ns))
 
     def tunnel(self, target_system: int, payload_type: int, payload: bytes) -> bytes:
@@ -299,6 +315,18 @@ class Codec:
         )
 
 
+class _AddressedTimesync(dialect.MAVLink_timesync_message):  # type: ignore[misc]  # untyped
+    """A TIMESYNC for one companion."""
+
+    def __init__(self, tc1_ns: int, ts1_ns: int, target_system: int) -> None:
+        super().__init__(tc1_ns, ts1_ns)
+        self._target_system = target_system
+
+    def pack(self, mav: Any, force_mavlink1: bool = False) -> bytes:
+        payload = _TIMESYNC.pack(self.tc1, self.ts1, self._target_system, COMPONENT_COMPANION)
+        return bytes(self._pack(mav, self.crc_extra, payload, force_mavlink1=force_mavlink1))
+
+
 def _next_magic(data: bytes, at: int) -> int:
     found = [i for i in (data.find(_MAGIC_1, at), data.find(_MAGIC_2, at)) if i >= 0]
     return min(found, default=len(data))
@@ -312,7 +340,9 @@ def _heartbeat(m: Any, sender: _Sender) -> Message | str:
 
 
 def _timesync(m: Any, sender: _Sender) -> Message | str:
-    return Timesync(*sender, m.tc1, m.ts1)
+    frame = m.get_msgbuf()
+    payload = bytes(frame[_HEAD_2 : _HEAD_2 + min(frame[1], _TIMESYNC.size)])
+    return Timesync(*sender, *_TIMESYNC.unpack(payload.ljust(_TIMESYNC.size, b"\0")))
 
 
 def _attitude(m: Any, sender: _Sender) -> Message | str:

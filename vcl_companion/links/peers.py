@@ -1,4 +1,4 @@
-"""The link to the other drones: heartbeats and TUNNEL payloads over one UDP socket."""
+"""The link to the other drones: heartbeats, TUNNEL payloads and the time, over one UDP socket."""
 
 from __future__ import annotations
 
@@ -6,8 +6,16 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from vcl_companion.clock import Clock
 from vcl_companion.links.counters import LinkCounters, LinkTally
-from vcl_companion.links.mavlink import COMPONENT_COMPANION, Codec, Heartbeat, Message, Tunnel
+from vcl_companion.links.mavlink import (
+    COMPONENT_COMPANION,
+    Codec,
+    Heartbeat,
+    Message,
+    Timesync,
+    Tunnel,
+)
 from vcl_companion.links.reconnect import Address
 from vcl_companion.links.transport import open_peer_socket, parse_peers
 
@@ -15,6 +23,8 @@ _HEARTBEAT_S = 1.0
 # A member that was silent for longer may have moved to another address.
 _ADDRESS_STALE_S = 5.0
 _STATE_ACTIVE = 4
+# Nobody who means it asks for the time more often.
+_LEAST_BETWEEN_ANSWERS_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -44,6 +54,8 @@ class PeerLink:
         members: system ids of the swarm; nobody else is heard.
         on_tunnel: takes a payload for us or for everybody.
         on_heartbeat: takes the system id of a member that has shown itself.
+        clock: what members that ask for the time are told.
+        on_time: takes a member's answer about the time: system id, ts1, tc1.
     """
 
     def __init__(
@@ -53,15 +65,20 @@ class PeerLink:
         members: frozenset[int],
         on_tunnel: Callable[[Tunnel], None],
         on_heartbeat: Callable[[int], None],
+        clock: Clock,
+        on_time: Callable[[int, int, int], None],
     ) -> None:
         self._system_id = system_id
         self._members = members
         self._on_tunnel = on_tunnel
         self._on_heartbeat = on_heartbeat
+        self._clock = clock
+        self._on_time = on_time
         self._tally = LinkTally()
         self._codec = Codec(system_id, COMPONENT_COMPANION, self._tally)
         self._socket = open_peer_socket(options.listen, options.to, self._tally)
         self._addresses: dict[int, tuple[Address, float]] = {}
+        self._told_time_at_s: dict[int, float] = {}
 
     @property
     def counters(self) -> LinkCounters:
@@ -83,7 +100,13 @@ class PeerLink:
         Raises:
             ValueError: the payload is too long.
         """
-        frame = self._codec.tunnel(target_system, payload_type, payload)
+        self._send(self._codec.tunnel(target_system, payload_type, payload), target_system)
+
+    def ask_time(self, ts1_ns: int, target_system: int) -> None:
+        """Ask a member for its time; the answer comes to ``on_time`` with this ``ts1_ns``."""
+        self._send(self._codec.timesync(0, ts1_ns, target_system), target_system)
+
+    def _send(self, frame: bytes, target_system: int) -> None:
         address, heard_at_s = self._addresses.get(target_system, (None, 0.0))
         if address is None or asyncio.get_running_loop().time() - heard_at_s > _ADDRESS_STALE_S:
             self._socket.write(frame)
@@ -107,7 +130,22 @@ class PeerLink:
                     self._on_tunnel(message)
                 case Heartbeat():
                     self._on_heartbeat(message.sender_system)
+                case Timesync(tc1_ns=0):
+                    self._tell_time(message)
+                case Timesync():
+                    self._on_time(message.sender_system, message.ts1_ns, message.tc1_ns)
         return accepted
+
+    def _tell_time(self, question: Timesync) -> None:
+        """Answer at once: every moment in between makes the answer vaguer."""
+        asker, now_s = question.sender_system, asyncio.get_running_loop().time()
+        if now_s - self._told_time_at_s.get(asker, float("-inf")) < _LEAST_BETWEEN_ANSWERS_S:
+            self._tally.refuse("asked for the time too often")
+            return
+        now_ns = self._clock.now_ns()
+        if now_ns > 0:  # a clock that has not been told the time yet has none to tell
+            self._told_time_at_s[asker] = now_s
+            self._send(self._codec.timesync(now_ns, question.ts1_ns, asker), asker)
 
     def _refusal(self, message: Message) -> str | None:
         if message.sender_system == self._system_id:
@@ -121,6 +159,9 @@ class PeerLink:
                 return None
             case Tunnel(target_system=target):
                 return None if target in (0, self._system_id) else "tunnel for another system"
+            case Timesync(target_system=system, target_component=component):
+                is_ours = (system, component) == (self._system_id, COMPONENT_COMPANION)
+                return None if is_ours else "timesync for another"
         return "not a peer's message"
 
     def _beat(self) -> None:

@@ -14,9 +14,10 @@ MAX_REASON_BYTES = 90
 MAX_TRACKED = (1 << 16) - 1
 
 # FrameRequest body
-# | 0 | u32 | request id                                            |
-# | 4 | f64 | age of the wanted instant when the request was sent, s |
-_FRAME_REQUEST = struct.Struct("<Id")
+# | 0  | u32 | request id                                             |
+# | 4  | i64 | the wanted instant, ns, the asker's own clock          |
+# | 12 | f64 | age of the wanted instant when the request was sent, s |
+_FRAME_REQUEST = struct.Struct("<Iqd")
 
 # MapState body
 # | 0 | u8      | bytes of the revision: 0 (no map) or 8   |
@@ -39,14 +40,19 @@ class FrameRequest:
 
     Attributes:
         request_id: chosen by who asks, echoed in the answer.
-        frame_age_s: how long before the sending of this request the instant was.
+        at_ns: the instant, on the asker's own clock; who knows that clock goes by this.
+        frame_age_s: how long before the sending of this request the instant was, for
+            who does not know it.
     """
 
     request_id: int
+    at_ns: int
     frame_age_s: float
 
     def __post_init__(self) -> None:
         check_request_id(self.request_id)
+        if not -(1 << 63) <= self.at_ns < 1 << 63:
+            raise ValueError(f"an instant has 64 bits: {self.at_ns}")
         check_age(self.frame_age_s)
 
 
@@ -101,16 +107,16 @@ class MapRefused:
 
 def encode_frame_request(message: FrameRequest) -> bytes:
     """Return the body of a frame request."""
-    return _FRAME_REQUEST.pack(message.request_id, message.frame_age_s)
+    return _FRAME_REQUEST.pack(message.request_id, message.at_ns, message.frame_age_s)
 
 
 def decode_frame_request(body: bytes) -> FrameRequest:
     """Return the frame request of a body, or raise WireError."""
     reader = Reader(body, "frame request")
-    request_id, frame_age_s = reader.unpack(_FRAME_REQUEST)
+    request_id, at_ns, frame_age_s = reader.unpack(_FRAME_REQUEST)
     reader.finish()
     try:
-        return FrameRequest(request_id, frame_age_s)
+        return FrameRequest(request_id, at_ns, frame_age_s)
     except ValueError as error:
         raise WireError(f"frame request: {error}") from None
 
