@@ -1,6 +1,7 @@
 """Peer links among themselves, and against strangers, on loopback."""
 
 import asyncio
+from pathlib import Path
 
 import pytest
 
@@ -8,8 +9,9 @@ from tests.links import wire
 from tests.links.running import running, udp
 from tests.ports import free_ports
 from vcl_companion.errors import ConfigError
+from vcl_companion.links.key_file import make_key_file
 from vcl_companion.links.mavlink import Tunnel
-from vcl_companion.links.peers import PeerLink, PeerOptions
+from vcl_companion.links.peers import PeerLink, PeerOptions, open_signing
 
 MEMBERS = frozenset({1, 2, 3})
 PAYLOAD_TYPE = 40000
@@ -22,8 +24,9 @@ class Drone:
         self.tunnels: asyncio.Queue[Tunnel] = asyncio.Queue()
         self.beats: asyncio.Queue[int] = asyncio.Queue()
         self.link = PeerLink(
-            options, system_id, MEMBERS, self.tunnels.put_nowait, self.beats.put_nowait
-        )
+            options, system_id, MEMBERS, self.tunnels.put_nowait, self.beats.put_nowait,
+            open_signing(options),
+        )  # fmt: skip
 
     async def hears(self, *systems: int) -> None:
         missing = set(systems)
@@ -31,17 +34,31 @@ class Drone:
             missing.discard(await self.beats.get())
 
 
-def unicast(n: int) -> list[Drone]:
+@pytest.fixture
+def key(tmp_path: Path) -> str:
+    """The path of a new key."""
+    path = tmp_path / "swarm.key"
+    make_key_file(path)
+    return str(path)
+
+
+def unicast(n: int, key: str) -> list[Drone]:
+    """Drones that sign."""
     addresses = [f"127.0.0.1:{port}" for port in free_ports(n)]
     return [
-        Drone(PeerOptions(me, tuple(a for a in addresses if a != me)), k + 1)
+        Drone(PeerOptions(me, tuple(a for a in addresses if a != me), key, f"{key}.{k}"), k + 1)
         for k, me in enumerate(addresses)
     ]
 
 
-def test_unicast_reaches_all_or_the_one_addressed() -> None:
+def open_to_all(listen: str, *to: str) -> PeerOptions:
+    """A link without a key that takes everything."""
+    return PeerOptions(listen, to, allow_unsigned=True)
+
+
+def test_unicast_reaches_all_or_the_one_addressed(key: str) -> None:
     async def scenario() -> None:
-        drones = one, two, three = unicast(3)
+        drones = one, two, three = unicast(3, key)
         async with running(*(drone.link.run() for drone in drones)):
             await one.hears(2, 3)
             one.link.send(PAYLOAD_TYPE, b"to all")
@@ -51,7 +68,7 @@ def test_unicast_reaches_all_or_the_one_addressed() -> None:
             before = one.link.counters.bytes_out
             one.link.send(PAYLOAD_TYPE, b"to three" * 16, target_system=3)
             # Its address is known from its heartbeat: one datagram, and only there.
-            assert one.link.counters.bytes_out - before == 145
+            assert one.link.counters.bytes_out - before == 158
             assert await three.tunnels.get() == Tunnel(1, 197, 3, PAYLOAD_TYPE, b"to three" * 16)
             assert two.tunnels.empty()
             assert two.link.counters.refused.get("tunnel for another system", 0) == 0
@@ -59,9 +76,9 @@ def test_unicast_reaches_all_or_the_one_addressed() -> None:
     asyncio.run(scenario())
 
 
-def test_one_addressed_to_an_unknown_address_goes_to_all_and_is_ignored_by_others() -> None:
+def test_one_addressed_to_an_unknown_address_goes_to_all_and_is_ignored_by_others(key: str) -> None:
     async def scenario() -> None:
-        one, two, _ = unicast(3)
+        one, two, _ = unicast(3, key)
         async with running(one.link.run(), two.link.run()):
             await two.hears(1)
             await one.hears(2)
@@ -76,7 +93,7 @@ def test_one_addressed_to_an_unknown_address_goes_to_all_and_is_ignored_by_other
 def test_strangers_and_nonsense_are_counted_and_not_heard() -> None:
     async def scenario() -> None:
         port, other = free_ports(2)
-        drone = Drone(PeerOptions(f"127.0.0.1:{port}", (f"127.0.0.1:{other}",)), 1)
+        drone = Drone(open_to_all(f"127.0.0.1:{port}", f"127.0.0.1:{other}"), 1)
         async with udp(other) as side, running(drone.link.run()):
             await side.got.get()
             for data in (
@@ -110,7 +127,7 @@ def test_strangers_and_nonsense_are_counted_and_not_heard() -> None:
 def test_a_stranger_that_claims_to_be_a_member_is_never_answered() -> None:
     async def scenario() -> None:
         port, other = free_ports(2)
-        drone = Drone(PeerOptions(f"127.0.0.1:{port}", (f"127.0.0.1:{other}",)), 1)
+        drone = Drone(open_to_all(f"127.0.0.1:{port}", f"127.0.0.1:{other}"), 1)
         async with udp(other) as side, udp() as liar, running(drone.link.run()):
             await side.got.get()
             liar.transport.sendto(wire.heartbeat(2, 197), ("127.0.0.1", port))
@@ -124,11 +141,13 @@ def test_a_stranger_that_claims_to_be_a_member_is_never_answered() -> None:
 
 
 @pytest.mark.parametrize("group", ["127.255.255.255", "239.255.42.99"])
-def test_a_group_address_reaches_everybody_and_the_own_echo_is_ignored(group: str) -> None:
+def test_a_group_address_reaches_everybody_and_the_own_echo_is_ignored(
+    group: str, key: str
+) -> None:
     async def scenario() -> None:
         (port,) = free_ports(1)
         listen = "127.0.0.1" if group.startswith("239") else group
-        options = PeerOptions(f"{listen}:{port}", (f"{group}:{port}",))
+        options = PeerOptions(f"{listen}:{port}", (f"{group}:{port}",), key, "")
         drones = one, two, three = [Drone(options, k) for k in (1, 2, 3)]
         async with running(*(drone.link.run() for drone in drones)):
             await one.hears(2, 3)
@@ -146,9 +165,9 @@ def test_a_group_address_reaches_everybody_and_the_own_echo_is_ignored(group: st
     asyncio.run(scenario())
 
 
-def test_a_burst_of_a_map_is_not_lost_while_the_receiver_is_busy() -> None:
+def test_a_burst_of_a_map_is_not_lost_while_the_receiver_is_busy(key: str) -> None:
     async def scenario() -> None:
-        one, two = unicast(2)
+        one, two = unicast(2, key)
         async with running(one.link.run(), two.link.run()):
             await two.hears(1)
             for k in range(150):
@@ -168,4 +187,4 @@ def test_a_burst_of_a_map_is_not_lost_while_the_receiver_is_busy() -> None:
 )  # fmt: skip
 def test_wrong_peer_addresses_are_refused(listen: str, to: tuple[str, ...]) -> None:
     with pytest.raises(ConfigError):
-        PeerOptions(listen, to)
+        PeerOptions(listen, to, allow_unsigned=True)

@@ -1,20 +1,49 @@
-"""The link to the other drones: heartbeats and TUNNEL payloads over one UDP socket."""
+"""The link to the other drones: signed heartbeats and TUNNEL payloads over one UDP socket."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
+import secrets
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import dataclass
+from pathlib import Path
 
+from vcl_companion.clock import Moment, system_moment
+from vcl_companion.errors import ConfigError
 from vcl_companion.links.counters import LinkCounters, LinkTally
-from vcl_companion.links.mavlink import COMPONENT_COMPANION, Codec, Heartbeat, Message, Tunnel
+from vcl_companion.links.kept_signing import KeptSigning
+from vcl_companion.links.mavlink import (
+    COMPONENT_COMPANION,
+    Codec,
+    Heartbeat,
+    Message,
+    Timesync,
+    Tunnel,
+    Untimely,
+)
 from vcl_companion.links.reconnect import Address
+from vcl_companion.links.signing import AHEAD, BEHIND, FORGED, NO_KEY, UNSIGNED, SigningOptions
 from vcl_companion.links.transport import open_peer_socket, parse_peers
+
+_log = logging.getLogger(__name__)
 
 _HEARTBEAT_S = 1.0
 # A member that was silent for longer may have moved to another address.
 _ADDRESS_STALE_S = 5.0
 _STATE_ACTIVE = 4
+_QUESTION_BITS = 62
+# What an answer's own clock says is of no use to anybody; only a question's is 0.
+_ANSWERED = 1
+# Refusals that somebody should see to, and what it may be; told once each.
+_TELLING = {
+    UNSIGNED: "is a drone without a key?",
+    FORGED: "is the key the same on every drone?",
+    NO_KEY: "has this drone no key?",
+    AHEAD: "a drone's clock is ahead of ours",
+    BEHIND: "a drone's clock is behind ours",
+}
 
 
 @dataclass(frozen=True)
@@ -26,13 +55,39 @@ class PeerOptions:
             multicast group the address of the interface to join on.
         to: numeric IPv4 ADDRESS:PORT of every other drone, or one broadcast address, or
             one multicast group.
+        key_file: full path of the key that frames are signed with, the same on every drone;
+            empty for none.
+        timestamp_file: what signing remembers from one run to the next, a file for each
+            daemon; empty: nothing, for which the host needs a clock that is never wrong.
+        allow_unsigned: whether frames without a signature are taken.
     """
 
     listen: str = "0.0.0.0:14650"
     to: tuple[str, ...] = ()
+    key_file: str = ""
+    timestamp_file: str = "signing.json"
+    allow_unsigned: bool = False
 
     def __post_init__(self) -> None:
         parse_peers(self.listen, self.to)
+        if self.key_file and not Path(self.key_file).is_absolute():
+            raise ConfigError(f"key_file: a full path is needed, got {self.key_file!r}")
+        if self.to and not self.key_file and not self.allow_unsigned:
+            raise ConfigError(
+                "key_file: other drones in `to`, and no key to sign with: name a file here, "
+                "run `vcl keys new` once and `vcl keys install` on each drone; or set "
+                "allow_unsigned = true"
+            )
+
+
+def open_signing(options: PeerOptions, now: Callable[[], Moment] = system_moment) -> KeptSigning:
+    """Return the signing of the peer link, with its key and what the last run has left.
+
+    Raises:
+        ConfigError: the key cannot be used, or timestamps cannot be kept.
+    """
+    strictness = SigningOptions(allow_unsigned=options.allow_unsigned)
+    return KeptSigning(options.key_file, options.timestamp_file, strictness, now)
 
 
 class PeerLink:
@@ -44,6 +99,8 @@ class PeerLink:
         members: system ids of the swarm; nobody else is heard.
         on_tunnel: takes a payload for us or for everybody.
         on_heartbeat: takes the system id of a member that has shown itself.
+        signing: of ``open_signing``.
+        disk: does the writing that signing needs; None: the loop's own executor.
     """
 
     def __init__(
@@ -53,15 +110,22 @@ class PeerLink:
         members: frozenset[int],
         on_tunnel: Callable[[Tunnel], None],
         on_heartbeat: Callable[[int], None],
+        signing: KeptSigning,
+        disk: Executor | None = None,
     ) -> None:
         self._system_id = system_id
         self._members = members
         self._on_tunnel = on_tunnel
         self._on_heartbeat = on_heartbeat
+        self._kept = signing
+        self._disk = disk
         self._tally = LinkTally()
-        self._codec = Codec(system_id, COMPONENT_COMPANION, self._tally)
+        self._codec = Codec(
+            system_id, COMPONENT_COMPANION, self._tally, signing.signing, signing.now
+        )
         self._socket = open_peer_socket(options.listen, options.to, self._tally)
         self._addresses: dict[int, tuple[Address, float]] = {}
+        self._told: set[str] = set()
 
     @property
     def counters(self) -> LinkCounters:
@@ -73,6 +137,7 @@ class PeerLink:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._socket.run(self._receive, self._beat))
             group.create_task(self._heartbeats())
+            group.create_task(self._kept.run(self._disk))
 
     def send(self, payload_type: int, payload: bytes, target_system: int = 0) -> None:
         """Send a TUNNEL of at most 128 bytes to one member, or to all (0).
@@ -97,6 +162,9 @@ class PeerLink:
             if refusal is not None:
                 self._tally.refuse(refusal)
                 continue
+            if isinstance(message, Untimely):
+                self._hear_time(message)
+                continue
             accepted = True
             # Only configured addresses are ever sent to, whatever claims to be a member.
             if sender is not None and sender in self._socket.destinations:
@@ -107,7 +175,35 @@ class PeerLink:
                     self._on_tunnel(message)
                 case Heartbeat():
                     self._on_heartbeat(message.sender_system)
+                case Timesync():
+                    self._answer(message)
         return accepted
+
+    def _hear_time(self, message: Untimely) -> None:
+        """Find out what time it is with a member that is not of our time (``swarm_time.py``)."""
+        now, time = self._kept.now(), self._kept.signing.time
+        said = message.timesync
+        if said is not None and said.tc1_ns == 0:
+            self._answer(said)
+        elif said is not None:
+            ahead_s = time.told(said.ts1_ns, message.timestamp, now)
+            if ahead_s is not None:
+                _log.warning(
+                    "the swarm is %.0f s ahead of us, drone %d says: its time is ours now",
+                    ahead_s,
+                    message.sender_system,
+                )
+                return
+        if message.ahead:
+            number = secrets.randbits(_QUESTION_BITS)
+            if time.asks(number, now):
+                self._socket.write(self._codec.timesync(0, number))
+
+    def _answer(self, said: Timesync) -> None:
+        if said.tc1_ns == 0 and self._kept.signing.time.answers(
+            said.sender_system, self._kept.now()
+        ):
+            self._socket.write(self._codec.timesync(_ANSWERED, said.ts1_ns))
 
     def _refusal(self, message: Message) -> str | None:
         if message.sender_system == self._system_id:
@@ -117,7 +213,9 @@ class PeerLink:
         if message.sender_component != COMPONENT_COMPANION:
             return "not a companion"
         match message:
-            case Heartbeat():
+            case Heartbeat() | Untimely():
+                return None
+            case Timesync() if self._kept.signing.signs:
                 return None
             case Tunnel(target_system=target):
                 return None if target in (0, self._system_id) else "tunnel for another system"
@@ -130,3 +228,11 @@ class PeerLink:
         while True:
             await asyncio.sleep(_HEARTBEAT_S)
             self._beat()
+            self._tell()
+
+    def _tell(self) -> None:
+        """Let the log say, once, what keeps drones from hearing each other."""
+        refused = self._tally.snapshot().refused
+        for reason in _TELLING.keys() & refused.keys() - self._told:
+            self._told.add(reason)
+            _log.warning("peers: a frame was refused: %s (%s)", reason, _TELLING[reason])
