@@ -6,32 +6,15 @@ from pathlib import Path
 import pytest
 
 from tests.links import wire
+from tests.links.drones import Drone, unicast
 from tests.links.running import running, udp
 from tests.ports import free_ports
 from vcl_companion.errors import ConfigError
 from vcl_companion.links.key_file import make_key_file
 from vcl_companion.links.mavlink import Tunnel
-from vcl_companion.links.peers import PeerLink, PeerOptions, open_signing
+from vcl_companion.links.peers import PeerOptions
 
-MEMBERS = frozenset({1, 2, 3})
 PAYLOAD_TYPE = 40000
-
-
-class Drone:
-    """A peer link and what it heard."""
-
-    def __init__(self, options: PeerOptions, system_id: int) -> None:
-        self.tunnels: asyncio.Queue[Tunnel] = asyncio.Queue()
-        self.beats: asyncio.Queue[int] = asyncio.Queue()
-        self.link = PeerLink(
-            options, system_id, MEMBERS, self.tunnels.put_nowait, self.beats.put_nowait,
-            open_signing(options),
-        )  # fmt: skip
-
-    async def hears(self, *systems: int) -> None:
-        missing = set(systems)
-        while missing:
-            missing.discard(await self.beats.get())
 
 
 @pytest.fixture
@@ -40,15 +23,6 @@ def key(tmp_path: Path) -> str:
     path = tmp_path / "swarm.key"
     make_key_file(path)
     return str(path)
-
-
-def unicast(n: int, key: str) -> list[Drone]:
-    """Drones that sign."""
-    addresses = [f"127.0.0.1:{port}" for port in free_ports(n)]
-    return [
-        Drone(PeerOptions(me, tuple(a for a in addresses if a != me), key, f"{key}.{k}"), k + 1)
-        for k, me in enumerate(addresses)
-    ]
 
 
 def open_to_all(listen: str, *to: str) -> PeerOptions:

@@ -58,10 +58,8 @@ def read_passphrase(path: Path) -> str:
         ConfigError: as ``read_key_file``.
     """
     try:
-        # Without waiting: a pipe of that name has nobody at its other end.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-        with open(descriptor, "rb") as file:
-            about = os.fstat(descriptor)
+        with open(path, "rb", opener=_at_once) as file:
+            about = os.fstat(file.fileno())
             if not stat.S_ISREG(about.st_mode):
                 raise ConfigError(f"{path}: is no file")
             if about.st_mode & _FORBIDDEN:
@@ -113,6 +111,11 @@ def install_key_file(source: Path, target: Path, like: Path | None = None) -> Si
     except (OSError, ValueError) as error:
         raise ConfigError(f"{target}: cannot be installed ({_why(error)})") from error
     return _key_of(passphrase)
+
+
+def _at_once(path: str, flags: int) -> int:
+    """Open without waiting: a pipe of that name may have nobody at its other end."""
+    return os.open(path, flags | os.O_NONBLOCK)
 
 
 def _write(path: Path, passphrase: str, mode: int) -> None:

@@ -33,8 +33,6 @@ from vcl_companion.links.counters import LinkTally
 from vcl_companion.links.signing import (
     AHEAD,
     BEHIND,
-    LINK_TO_ALL,
-    LINK_TO_ONE,
     SIGNED_FLAG,
     TRAILER_BYTES,
     Signing,
@@ -281,20 +279,20 @@ class Codec:
         timesync = said if isinstance(said, Timesync) else None
         return Untimely(frame[5], frame[6], timestamp_of(frame), ahead, timesync)
 
-    def _pack(self, message: Any, link_id: int = LINK_TO_ALL) -> bytes:
+    def _pack(self, message: Any) -> bytes:
         frame = bytes(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
         self._tally.messages_out += 1
         if self._signing is None or not self._signing.signs:
             return frame
-        return self._signed(self._signing, frame, message.crc_extra, link_id)
+        return self._signed(self._signing, frame, message.crc_extra)
 
-    def _signed(self, signing: Signing, frame: bytes, crc_extra: int, link_id: int) -> bytes:
+    def _signed(self, signing: Signing, frame: bytes, crc_extra: int) -> bytes:
         """Return a frame that says that it is signed, and is."""
         body = frame[1:2] + bytes([SIGNED_FLAG]) + frame[3:-_CHECKSUM_BYTES]
         checksum = int(dialect.x25crc(body + bytes([crc_extra])).crc)
         whole = frame[:1] + body + checksum.to_bytes(_CHECKSUM_BYTES, "little")
-        return whole + signing.trailer(whole, link_id, self._now())
+        return whole + signing.trailer(whole, self._now())
 
     def heartbeat(self, system_status: int) -> bytes:
         """Return a companion's HEARTBEAT with a MAV_STATE."""
@@ -328,8 +326,7 @@ class Codec:
                 payload_type,
                 len(payload),
                 payload.ljust(MAX_TUNNEL_BYTES, b"\0"),
-            ),
-            LINK_TO_ONE if target_system else LINK_TO_ALL,
+            )
         )
 
     def status_text(self, severity: int, text: bytes, text_id: int, chunk: int) -> bytes:

@@ -2,7 +2,7 @@
 
 After the frame's checksum, little endian (https://mavlink.io/en/guide/message_signing.html):
 
-    0      link id: 0 what goes to everybody, 1 what goes to one
+    0      link id: 0, we have one link
     1..6   timestamp: ticks of 10 us since 1 January 2015, GMT
     7..12  first 6 bytes of SHA-256 of: the key, the frame from its magic number to its
            checksum, link id and timestamp
@@ -12,15 +12,16 @@ A frame is taken when, in this order,
 1. it is signed (RADIO_STATUS need not be: radios have no key, and it says nothing to us),
 2. the signature is right,
 3. the timestamp is within the allowed skew of ours (``swarm_time.py``), in both directions,
-4. and later than that of every frame before it of the same sender, component and link id.
+4. and none with that timestamp has come from the same sender, component and link id, nor
+   one that is younger by more than a second, as long as that is what frames overtake each
+   other by. (The guide wants them to rise strictly. Datagrams do not always: an access
+   point holds broadcasts back for those who sleep, and all would be lost that way.)
 
 Nothing is remembered of a frame before all of that holds: pymavlink's verifier stores the
 timestamp before it looks at the signature, so that one forged frame of the far future locks
-the true sender out. A mark that is older than the skew is forgotten: what it would refuse
-is refused as too old, so the marks are as many as there are senders, and no stranger adds any.
-
-What goes to everybody and what goes to one have link ids of their own: Wi-Fi holds
-broadcasts back for those who sleep, and would have them come after younger frames.
+the true sender out. A stream that has been silent for longer than the skew is forgotten:
+what its mark would refuse is refused as too old. So there are as many marks as there are
+senders, and no stranger adds any.
 
 This protects against those who do not have the key. Those who have it can say anything in
 anybody's name; and nothing is hidden from those who listen.
@@ -40,7 +41,6 @@ from vcl_companion.links.swarm_time import TICKS_PER_S, SwarmTime
 SIGNED_FLAG = 0x01
 TRAILER_BYTES = 13
 SECRET_BYTES = 32
-LINK_TO_ALL, LINK_TO_ONE = 0, 1
 AHEAD: Final = "timestamp in the future"
 BEHIND: Final = "timestamp too old"
 UNSIGNED: Final = "not signed"
@@ -50,10 +50,12 @@ NO_KEY: Final = "no key to verify with"
 
 _SIGNATURE_BYTES = 6
 _RADIO_STATUS_ID = 109
+_LINK_ID = 0
 _MAX_STREAMS = 1024
+_MAX_HEARD = 4096  # timestamps remembered of one stream
 
 Stream = tuple[int, int, int]
-"""System, component and link id of a sender; its timestamps rise."""
+"""System, component and link id of a sender."""
 
 
 class SigningKey:
@@ -89,10 +91,36 @@ class SigningOptions:
     Attributes:
         allow_unsigned: frames without a signature are taken as well.
         skew_s: how far a frame's timestamp may be off ours, in both directions.
+        overtaking_s: how much older than the youngest of its stream a frame may be.
     """
 
     allow_unsigned: bool = False
     skew_s: float = 60.0
+    overtaking_s: float = 1.0
+
+
+class _Heard:
+    """The timestamps that were taken from one stream: all up to ``_floor``, and some above."""
+
+    def __init__(self, latest: int) -> None:
+        self.latest = latest
+        self._floor = latest
+        self._above: set[int] = set()
+
+    def takes(self, timestamp: int, overtaking: int) -> bool:
+        """Whether a timestamp is new; then it is not new any more."""
+        if timestamp <= self._floor or timestamp in self._above:
+            return False
+        self._above.add(timestamp)
+        self.latest = max(self.latest, timestamp)
+        self._floor = max(self._floor, self.latest - overtaking)
+        if len(self._above) > _MAX_HEARD:
+            above = sorted(at for at in self._above if at > self._floor)
+            if len(above) > _MAX_HEARD // 2:
+                self._floor = above[-_MAX_HEARD // 2 - 1]
+                above = above[-_MAX_HEARD // 2 :]
+            self._above = set(above)
+        return True
 
 
 class Signing:
@@ -115,16 +143,17 @@ class Signing:
     ) -> None:
         self.time = time
         self._key = key
-        self._marks = dict(marks or {})
+        self._heard = {stream: _Heard(latest) for stream, latest in (marks or {}).items()}
         self._options = options or SigningOptions()
         self._skew = round(self._options.skew_s * TICKS_PER_S)
+        self._overtaking = round(self._options.overtaking_s * TICKS_PER_S)
 
     @property
     def signs(self) -> bool:
         """Whether there is a key to sign with."""
         return self._key is not None
 
-    def trailer(self, frame: bytes, link_id: int, now: Moment) -> bytes:
+    def trailer(self, frame: bytes, now: Moment) -> bytes:
         """Return the 13 bytes that follow a frame, which says that it is signed, and its checksum.
 
         Raises:
@@ -132,7 +161,7 @@ class Signing:
         """
         if self._key is None:
             raise ValueError("there is no key to sign with")
-        told = bytes([link_id]) + self.time.next(now).to_bytes(6, "little")
+        told = bytes([_LINK_ID]) + self.time.next(now).to_bytes(6, "little")
         return told + self._key.signature(frame + told)
 
     def refusal(self, frame: bytes, now: Moment) -> str | None:
@@ -156,23 +185,23 @@ class Signing:
         if timestamp < ours - self._skew:
             return BEHIND
         stream = (frame[5], frame[6], frame[-TRAILER_BYTES])
-        if timestamp <= self._marks.get(stream, -1):
-            return REPLAYED
-        if stream not in self._marks and len(self._marks) >= _MAX_STREAMS:
-            self._forget(ours)
-            if len(self._marks) >= _MAX_STREAMS:
+        heard = self._heard.get(stream)
+        if heard is None:
+            if len(self._heard) >= _MAX_STREAMS:
+                self._forget(ours)
+            if len(self._heard) >= _MAX_STREAMS:
                 return "too many streams"
-        self._marks[stream] = timestamp
-        return None
+            heard = self._heard[stream] = _Heard(timestamp - self._overtaking)
+        return None if heard.takes(timestamp, self._overtaking) else REPLAYED
 
     def marks(self, now: Moment) -> dict[Stream, int]:
         """Return the latest timestamp of each stream that is not too old to matter."""
         self._forget(self.time.at(now))
-        return dict(self._marks)
+        return {stream: heard.latest for stream, heard in self._heard.items()}
 
     def _forget(self, ours: int) -> None:
         oldest = ours - self._skew
-        self._marks = {stream: at for stream, at in self._marks.items() if at >= oldest}
+        self._heard = {k: heard for k, heard in self._heard.items() if heard.latest >= oldest}
 
 
 def timestamp_of(frame: bytes) -> int:
