@@ -86,6 +86,8 @@ def open_signing(options: PeerOptions, now: Callable[[], Moment] = system_moment
     Raises:
         ConfigError: the key cannot be used, or timestamps cannot be kept.
     """
+    if options.allow_unsigned and options.to:
+        _log.warning("peers: frames are taken from whoever sends them (allow_unsigned)")
     strictness = SigningOptions(allow_unsigned=options.allow_unsigned)
     return KeptSigning(options.key_file, options.timestamp_file, strictness, now)
 
@@ -195,14 +197,15 @@ class PeerLink:
                 )
                 return
         if message.ahead:
-            number = secrets.randbits(_QUESTION_BITS)
+            number = -1 - secrets.randbits(_QUESTION_BITS)
             if time.asks(number, now):
                 self._socket.write(self._codec.timesync(0, number))
 
     def _answer(self, said: Timesync) -> None:
-        if said.tc1_ns == 0 and self._kept.signing.time.answers(
-            said.sender_system, self._kept.now()
-        ):
+        """Repeat the number of a question about the swarm's time, signed; else say nothing."""
+        if said.tc1_ns != 0 or said.ts1_ns >= 0:
+            return
+        if self._kept.signing.time.answers(said.sender_system, self._kept.now()):
             self._socket.write(self._codec.timesync(_ANSWERED, said.ts1_ns))
 
     def _refusal(self, message: Message) -> str | None:
@@ -215,7 +218,8 @@ class PeerLink:
         match message:
             case Heartbeat() | Untimely():
                 return None
-            case Timesync() if self._kept.signing.signs:
+            # Below 0: of the swarm's time; no clock stands there.
+            case Timesync(ts1_ns=number) if number < 0 and self._kept.signing.signs:
                 return None
             case Tunnel(target_system=target):
                 return None if target in (0, self._system_id) else "tunnel for another system"

@@ -11,8 +11,9 @@ So the swarm's time is its own. It is the **latest** that any member knows, and 
   wall clock that is set back changes nothing.
 * Who hears that a member is ahead by more than the allowed skew asks it for the time. What
   it was told **before** it asked proves nothing: it may be a recording of another flight. So
-  the question is a TIMESYNC with a random number, and only a signed answer that repeats
-  that number moves our time: it was signed after the question was, by one who has the key.
+  the question is a TIMESYNC with a random number (below 0, where no clock stands), and only
+  a signed answer that repeats that number moves our time: it was signed after the question
+  was, by one who has the key.
 * One who is far behind must be able to ask, so a question is answered whatever its own
   timestamp. That gives nothing away: an answer to an old question is nobody's any more.
 
