@@ -40,6 +40,8 @@ def daemon_config(
         "peers": {
             "listen": f"127.0.0.1:{peer_port}",
             "to": [f"127.0.0.1:{port}" for port in other_peer_ports],
+            "key_file": str(key_path(out).resolve()),
+            "timestamp_file": str(run / "signing.json"),
         },
         "swarm": {
             "members": [drone.system_id for drone in plan.drones],
@@ -55,6 +57,11 @@ def daemon_config(
         # Frames as fast as they can be looked at would leave maps no time at all.
         wiring["scheduling"] = "normal"
     return with_settings(wiring, plan.options.settings)
+
+
+def key_path(out: Path) -> Path:
+    """Return where a flight's key is: the drones sign with it, and it ends with the flight."""
+    return out / "run" / "swarm.key"
 
 
 def with_settings(config: Mapping[str, Any], settings: Sequence[Setting]) -> dict[str, Any]:

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import sitl
-from sitl.daemon_config import daemon_config, toml_text
+from sitl.daemon_config import daemon_config, key_path, toml_text
 from sitl.frame_server import FrameServer
 from sitl.plan import FlightPlan, PlannedDrone
 from sitl.processes import Child, FlightError, end_children, start_child, unless_one_ends
 from sitl.stand_in_process import StandIn, start_stand_in
+from vcl_companion.links.key_file import make_key_file
 
 _END_TIMEOUT_S = 10.0
 # A daemon asks ten times a second until it has enough answers.
@@ -71,7 +72,9 @@ class Swarm:
 
         Raises:
             FlightError: one does not start, or ends at once.
+            ConfigError: the folder cannot be written.
         """
+        make_key_file(key_path(self._out))
         for planned in self._plan.drones:
             camera = FrameServer(planned.name)
             self._cameras.append(camera)

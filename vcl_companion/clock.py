@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import Protocol
 
 
@@ -39,3 +40,22 @@ class ManualClock:
     def advance_to(self, now_ns: int) -> None:
         """Set the clock to ``now_ns``; an earlier instant is ignored, time never runs back."""
         self._now_ns = max(self._now_ns, now_ns)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One instant by both of the host's clocks.
+
+    Attributes:
+        wall_ns: since 1970, GMT; steps in either direction when somebody sets it, and
+            starts anywhere on a board that has no battery for it.
+        monotonic_ns: never steps back; counts from an arbitrary start.
+    """
+
+    wall_ns: int
+    monotonic_ns: int
+
+
+def system_moment() -> Moment:
+    """Return the host's present instant."""
+    return Moment(time.time_ns(), time.monotonic_ns())

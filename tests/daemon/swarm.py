@@ -32,8 +32,9 @@ from vcl_companion.daemon.worker import Worker
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.counters import LinkCounters
+from vcl_companion.links.key_file import make_key_file
 from vcl_companion.links.mavlink import Tunnel
-from vcl_companion.links.peers import PeerLink, PeerOptions
+from vcl_companion.links.peers import PeerLink, PeerOptions, open_signing
 from vcl_companion.localization.intra import LocalizationOptions, Localized
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.pose_filter import FilterOptions
@@ -105,7 +106,7 @@ class Drone:
         )  # fmt: skip
         self._link = PeerLink(
             peers, system_id, frozenset(members), self._hear, self.exchange.on_heartbeat,
-            clock, self.exchange.clocks.answered,
+            clock, self.exchange.clocks.answered, open_signing(peers),
         )  # fmt: skip
         self.exchange.attach(self._link)
 
@@ -228,7 +229,7 @@ class Stranger:
         self.clock = ManualClock()
         self._link = PeerLink(
             peers, system_id, frozenset(members), self._hear, lambda _: None,
-            self.clock, lambda *_: None,
+            self.clock, lambda *_: None, open_signing(peers),
         )  # fmt: skip
         self.forget()
         self.messages: asyncio.Queue[Message] = asyncio.Queue()
@@ -315,6 +316,8 @@ class Swarm:
     def __init__(self, members: tuple[int, ...], path: Path, stack: contextlib.AsyncExitStack):
         self._members = members
         self._path = path
+        self._key = path.resolve() / "swarm.key"
+        make_key_file(self._key)
         self._stack = stack
         ports = free_ports(len(members))
         self._addresses = {m: f"127.0.0.1:{p}" for m, p in zip(members, ports, strict=True)}
@@ -395,7 +398,8 @@ class Swarm:
 
     def _peers(self, system_id: int) -> PeerOptions:
         others = tuple(a for m, a in self._addresses.items() if m != system_id)
-        return PeerOptions(self._addresses[system_id], others)
+        remembered = str(self._path / f"{system_id}-signing.json")
+        return PeerOptions(self._addresses[system_id], others, str(self._key), remembered)
 
 
 @contextlib.asynccontextmanager

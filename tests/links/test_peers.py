@@ -1,51 +1,40 @@
 """Peer links among themselves, and against strangers, on loopback."""
 
 import asyncio
+from pathlib import Path
 
 import pytest
 
 from tests.links import wire
+from tests.links.drones import Drone, unicast
 from tests.links.running import running, udp
 from tests.ports import free_ports
-from vcl_companion.clock import Clock, ManualClock, SystemClock
+from vcl_companion.clock import ManualClock, SystemClock
 from vcl_companion.errors import ConfigError
+from vcl_companion.links.key_file import make_key_file
 from vcl_companion.links.mavlink import Tunnel
-from vcl_companion.links.peers import PeerLink, PeerOptions
+from vcl_companion.links.peers import PeerOptions
 from vcl_companion.swarm.peer_time import PeerTime
 
-MEMBERS = frozenset({1, 2, 3})
 PAYLOAD_TYPE = 40000
 
 
-class Drone:
-    """A peer link and what it heard."""
-
-    def __init__(self, options: PeerOptions, system_id: int, clock: Clock | None = None) -> None:
-        self.times: asyncio.Queue[tuple[int, int, int]] = asyncio.Queue()
-        self.tunnels: asyncio.Queue[Tunnel] = asyncio.Queue()
-        self.beats: asyncio.Queue[int] = asyncio.Queue()
-        self.link = PeerLink(
-            options, system_id, MEMBERS, self.tunnels.put_nowait, self.beats.put_nowait,
-            clock or ManualClock(), lambda *answer: self.times.put_nowait(answer),
-        )  # fmt: skip
-
-    async def hears(self, *systems: int) -> None:
-        missing = set(systems)
-        while missing:
-            missing.discard(await self.beats.get())
+@pytest.fixture
+def key(tmp_path: Path) -> str:
+    """The path of a new key."""
+    path = tmp_path / "swarm.key"
+    make_key_file(path)
+    return str(path)
 
 
-def unicast(n: int) -> list[Drone]:
-    addresses = [f"127.0.0.1:{port}" for port in free_ports(n)]
-    return [
-        Drone(PeerOptions(me, tuple(a for a in addresses if a != me)), k + 1)
-        for k, me in enumerate(addresses)
-    ]
+def open_to_all(listen: str, *to: str) -> PeerOptions:
+    """A link without a key that takes everything."""
+    return PeerOptions(listen, to, allow_unsigned=True)
 
 
-def test_unicast_reaches_all_or_the_one_addressed() -> None:
+def test_unicast_reaches_all_or_the_one_addressed(key: str) -> None:
     async def scenario() -> None:
-        drones = one, two, three = unicast(3)
+        drones = one, two, three = unicast(3, key)
         async with running(*(drone.link.run() for drone in drones)):
             await one.hears(2, 3)
             one.link.send(PAYLOAD_TYPE, b"to all")
@@ -55,7 +44,7 @@ def test_unicast_reaches_all_or_the_one_addressed() -> None:
             before = one.link.counters.bytes_out
             one.link.send(PAYLOAD_TYPE, b"to three" * 16, target_system=3)
             # Its address is known from its heartbeat: one datagram, and only there.
-            assert one.link.counters.bytes_out - before == 145
+            assert one.link.counters.bytes_out - before == 158
             assert await three.tunnels.get() == Tunnel(1, 197, 3, PAYLOAD_TYPE, b"to three" * 16)
             assert two.tunnels.empty()
             assert two.link.counters.refused.get("tunnel for another system", 0) == 0
@@ -63,9 +52,9 @@ def test_unicast_reaches_all_or_the_one_addressed() -> None:
     asyncio.run(scenario())
 
 
-def test_one_addressed_to_an_unknown_address_goes_to_all_and_is_ignored_by_others() -> None:
+def test_one_addressed_to_an_unknown_address_goes_to_all_and_is_ignored_by_others(key: str) -> None:
     async def scenario() -> None:
-        one, two, _ = unicast(3)
+        one, two, _ = unicast(3, key)
         async with running(one.link.run(), two.link.run()):
             await two.hears(1)
             await one.hears(2)
@@ -80,7 +69,7 @@ def test_one_addressed_to_an_unknown_address_goes_to_all_and_is_ignored_by_other
 def test_strangers_and_nonsense_are_counted_and_not_heard() -> None:
     async def scenario() -> None:
         port, other = free_ports(2)
-        drone = Drone(PeerOptions(f"127.0.0.1:{port}", (f"127.0.0.1:{other}",)), 1)
+        drone = Drone(open_to_all(f"127.0.0.1:{port}", f"127.0.0.1:{other}"), 1)
         async with udp(other) as side, running(drone.link.run()):
             await side.got.get()
             for data in (
@@ -127,8 +116,8 @@ def test_two_links_relate_their_clocks_within_the_bound() -> None:
     async def scenario() -> None:
         ours, theirs = SystemClock(), SkewedClock(-123_456_789, 80e-6)
         listen = [f"127.0.0.1:{port}" for port in free_ports(2)]
-        one = Drone(PeerOptions(listen[0], (listen[1],)), 1, ours)
-        two = Drone(PeerOptions(listen[1], (listen[0],)), 2, theirs)
+        one = Drone(open_to_all(listen[0], listen[1]), 1, clock=ours)
+        two = Drone(open_to_all(listen[1], listen[0]), 2, clock=theirs)
         async with running(one.link.run(), two.link.run()):
             await one.hears(2)
             time = PeerTime()
@@ -153,8 +142,9 @@ def test_two_links_relate_their_clocks_within_the_bound() -> None:
 def test_who_asks_for_the_time_all_the_time_is_answered_now_and_then() -> None:
     async def scenario() -> None:
         port, other = free_ports(2)
-        options = PeerOptions(f"127.0.0.1:{port}", (f"127.0.0.1:{other}",))
-        drone = Drone(options, 1, ManualClock(77))
+        drone = Drone(
+            open_to_all(f"127.0.0.1:{port}", f"127.0.0.1:{other}"), 1, clock=ManualClock(77)
+        )
         async with udp(other) as side, running(drone.link.run()):
             await side.got.get()
             for ts1_ns in range(1, 51):
@@ -177,9 +167,9 @@ def test_who_asks_for_the_time_all_the_time_is_answered_now_and_then() -> None:
     asyncio.run(scenario())
 
 
-def test_a_clock_that_was_not_told_the_time_tells_none() -> None:
+def test_a_clock_that_was_not_told_the_time_tells_none(key: str) -> None:
     async def scenario() -> None:
-        one, two, _ = unicast(3)
+        one, two, _ = unicast(3, key)
         async with running(one.link.run(), two.link.run()):
             await one.hears(2)
             await two.hears(1)
@@ -196,7 +186,7 @@ def test_a_clock_that_was_not_told_the_time_tells_none() -> None:
 def test_a_stranger_that_claims_to_be_a_member_is_never_answered() -> None:
     async def scenario() -> None:
         port, other = free_ports(2)
-        drone = Drone(PeerOptions(f"127.0.0.1:{port}", (f"127.0.0.1:{other}",)), 1)
+        drone = Drone(open_to_all(f"127.0.0.1:{port}", f"127.0.0.1:{other}"), 1)
         async with udp(other) as side, udp() as liar, running(drone.link.run()):
             await side.got.get()
             liar.transport.sendto(wire.heartbeat(2, 197), ("127.0.0.1", port))
@@ -210,11 +200,13 @@ def test_a_stranger_that_claims_to_be_a_member_is_never_answered() -> None:
 
 
 @pytest.mark.parametrize("group", ["127.255.255.255", "239.255.42.99"])
-def test_a_group_address_reaches_everybody_and_the_own_echo_is_ignored(group: str) -> None:
+def test_a_group_address_reaches_everybody_and_the_own_echo_is_ignored(
+    group: str, key: str
+) -> None:
     async def scenario() -> None:
         (port,) = free_ports(1)
         listen = "127.0.0.1" if group.startswith("239") else group
-        options = PeerOptions(f"{listen}:{port}", (f"{group}:{port}",))
+        options = PeerOptions(f"{listen}:{port}", (f"{group}:{port}",), key, "")
         drones = one, two, three = [Drone(options, k) for k in (1, 2, 3)]
         async with running(*(drone.link.run() for drone in drones)):
             await one.hears(2, 3)
@@ -232,9 +224,9 @@ def test_a_group_address_reaches_everybody_and_the_own_echo_is_ignored(group: st
     asyncio.run(scenario())
 
 
-def test_a_burst_of_a_map_is_not_lost_while_the_receiver_is_busy() -> None:
+def test_a_burst_of_a_map_is_not_lost_while_the_receiver_is_busy(key: str) -> None:
     async def scenario() -> None:
-        one, two = unicast(2)
+        one, two = unicast(2, key)
         async with running(one.link.run(), two.link.run()):
             await two.hears(1)
             for k in range(150):
@@ -254,4 +246,4 @@ def test_a_burst_of_a_map_is_not_lost_while_the_receiver_is_busy() -> None:
 )  # fmt: skip
 def test_wrong_peer_addresses_are_refused(listen: str, to: tuple[str, ...]) -> None:
     with pytest.raises(ConfigError):
-        PeerOptions(listen, to)
+        PeerOptions(listen, to, allow_unsigned=True)

@@ -63,7 +63,12 @@ def test_a_daemon_is_told_where_things_are_and_nothing_of_the_truth(tmp_path: Pa
             "calibration": str(folder / "mav1" / "cam0" / "sensor.yaml"),
         },
         "autopilot": {"link": "udp:127.0.0.1:5002"},
-        "peers": {"listen": "127.0.0.1:5003", "to": ["127.0.0.1:5004", "127.0.0.1:5005"]},
+        "peers": {
+            "listen": "127.0.0.1:5003",
+            "to": ["127.0.0.1:5004", "127.0.0.1:5005"],
+            "key_file": str(tmp_path / "out" / "run" / "swarm.key"),
+            "timestamp_file": str(run / "signing.json"),
+        },
         "swarm": {"members": [1, 2, 3], "leader": 1, "known_distances": [[1, 2, 2.0]]},
         "log": {"flight_log": str(run / "flight.jsonl"), "level": "debug"},
         "map": {"directory": str(run / "maps")},

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -111,6 +112,21 @@ def test_a_flight_leaves_the_files_that_the_format_promises(flown: Path, recordi
     first, true = (read_tum(flown / "mav0" / f"{kind}.tum")[0][1] for kind in ("estimate", "truth"))
     assert first.translation == pytest.approx(true.translation, abs=1e-6)
     assert (flown / "report.html").stat().st_size > 50_000
+
+
+def test_the_drones_of_a_flight_sign_what_they_say_to_each_other(flown: Path) -> None:
+    key = flown / "run" / "swarm.key"
+    assert key.stat().st_mode & 0o077 == 0
+    secret = key.read_text().strip().encode()
+    for name in DRONES:
+        config = tomllib.loads((flown / "run" / name / "daemon.toml").read_text())
+        assert config["peers"]["key_file"] == str(key)
+        # It has taken signed frames of all others, and so have they of it.
+        remembered = json.loads((flown / "run" / name / "signing.json").read_text())
+        heard = {stream[0] for stream in remembered["streams"]}
+        assert heard == set(config["swarm"]["members"]) - {config["system_id"]}
+    told = (path for path in flown.rglob("*") if path.is_file() and path != key)
+    assert not any(secret in path.read_bytes() for path in told)
 
 
 def test_nothing_of_the_truth_reaches_a_daemon(

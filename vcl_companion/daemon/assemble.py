@@ -42,7 +42,7 @@ from vcl_companion.daemon.worker import Worker
 from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.errors import VclError
 from vcl_companion.links.autopilot import AutopilotLink
-from vcl_companion.links.peers import PeerLink
+from vcl_companion.links.peers import PeerLink, open_signing
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.mapping.warm_up import warm_up
 from vcl_companion.recording.sensor import read_sensor
@@ -105,6 +105,7 @@ async def _run(config: Config) -> int:
     sensor = read_sensor(Path(config.camera.calibration))
     log = FlightLog(config.log.flight_log, clock)
     maps = MapStore(config.map.directory)
+    signing = open_signing(config.peers)
     group = Group(config.swarm, config.system_id)
     camera = open_camera(config.camera, sensor, clock)
     autopilot = AutopilotLink(config.autopilot, config.system_id, clock)
@@ -209,6 +210,8 @@ async def _run(config: Config) -> int:
         exchange.on_heartbeat,
         clock,
         exchange.clocks.answered,
+        signing,
+        disk,
     )
     exchange.attach(peers)
     began_at_s, began_cpu_s = time.monotonic(), cpu_s()

@@ -11,7 +11,7 @@ Frame, little endian (https://mavlink.io/en/guide/serialization.html):
     7..9   message id
     10     payload, n bytes
     10+n   CRC-16/MCRF4XX over bytes 1.. and one byte that stands for the message's layout
-    12+n   signature, 13 bytes, when signed
+    12+n   signature, 13 bytes, when signed (signing.py)
 
 The dialect is ``ardupilotmega``: it contains ``common``, and the EKF_STATUS_REPORT
 of ArduPilot that ``common`` has not.
@@ -28,8 +28,17 @@ from typing import Any, Literal
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from vcl_companion.clock import Moment, system_moment
 from vcl_companion.geometry.rotation import Array, matrix_from_euler, matrix_from_quaternion
 from vcl_companion.links.counters import LinkTally
+from vcl_companion.links.signing import (
+    AHEAD,
+    BEHIND,
+    SIGNED_FLAG,
+    TRAILER_BYTES,
+    Signing,
+    timestamp_of,
+)
 
 COMPONENT_AUTOPILOT = 1
 COMPONENT_COMPANION = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
@@ -41,9 +50,8 @@ RESULT_ACCEPTED = 0
 
 _MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
 _OVERHEAD_1, _OVERHEAD_2 = 8, 12
-_SIGNED = 0x01
-_SIGNATURE_BYTES = 13
 _HEAD_2 = 10
+_CHECKSUM_BYTES = 2
 _QUATERNION_NORM_TOLERANCE = 0.05
 
 # TIMESYNC with the extension fields that pymavlink's layout ends before
@@ -107,6 +115,21 @@ class Timesync(Message):
 
 
 @dataclass(frozen=True)
+class Untimely(Message):
+    """A frame with a right signature and a wrong time: good for telling the time, no more.
+
+    Attributes:
+        timestamp: what it was signed with.
+        ahead: whether that is later than it may be, else earlier.
+        timesync: what it says, if it is a TIMESYNC.
+    """
+
+    timestamp: int
+    ahead: bool
+    timesync: Timesync | None
+
+
+@dataclass(frozen=True)
 class Tunnel(Message):
     """An opaque payload of at most 128 bytes; ``target_system`` 0 is everybody."""
 
@@ -151,11 +174,28 @@ class Codec:
 
     Bytes that are not what they should be never raise; they are counted by
     reason in the tally. At most one unfinished frame (280 bytes) is kept.
+
+    Args:
+        system_id: ours.
+        component_id: ours.
+        tally: where it counts.
+        signing: signs what goes out and judges what comes in; None: nothing is signed, and
+            signatures are not looked at.
+        now: tells the time that frames are signed with.
     """
 
-    def __init__(self, system_id: int, component_id: int, tally: LinkTally) -> None:
+    def __init__(
+        self,
+        system_id: int,
+        component_id: int,
+        tally: LinkTally,
+        signing: Signing | None = None,
+        now: Callable[[], Moment] = system_moment,
+    ) -> None:
         self._mav = dialect.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._tally = tally
+        self._signing = signing
+        self._now = now
         self._rest = b""
 
     def decode_stream(self, data: bytes) -> list[Message]:
@@ -188,12 +228,12 @@ class Codec:
             if len(data) - at < 3:
                 return messages, data[at:]
             flags = data[at + 2] if magic == _MAGIC_2 else 0
-            if flags & ~_SIGNED:
+            if flags & ~SIGNED_FLAG:
                 self._tally.refuse("unknown incompatibility flags")
                 at += 1
                 continue
             overhead = _OVERHEAD_2 if magic == _MAGIC_2 else _OVERHEAD_1
-            end = at + overhead + data[at + 1] + (_SIGNATURE_BYTES if flags else 0)
+            end = at + overhead + data[at + 1] + (TRAILER_BYTES if flags else 0)
             if end > len(data):
                 return messages, data[at:]
             message, consumed = self._frame(data[at:end], data[end : end + 1])
@@ -213,7 +253,7 @@ class Codec:
             whole = following in (b"", bytes([_MAGIC_1]), bytes([_MAGIC_2]))
             self._tally.refuse("unknown message" if whole else "garbage bytes")
             return None, whole
-        signature = _SIGNATURE_BYTES if not old and frame[2] & _SIGNED else 0
+        signature = TRAILER_BYTES if not old and frame[2] & SIGNED_FLAG else 0
         body_end = len(frame) - 2 - signature
         checksum = dialect.x25crc(frame[1:body_end] + bytes([layout.crc_extra])).crc
         if checksum != int.from_bytes(frame[body_end : body_end + 2], "little"):
@@ -223,22 +263,50 @@ class Codec:
             self._tally.refuse("MAVLink 1")
             return None, True
         self._tally.messages_in += 1
-        read = _READERS.get(message_id)
-        if read is None:
+        if message_id == dialect.MAVLINK_MSG_ID_SETUP_SIGNING:
+            # It holds a key. Ours come from a file, and others' are not for anybody to see.
+            self._tally.refuse("a key by radio")
             return None, True
-        # A layout's payload, cut or with unknown extensions, is padded or cut to its size.
-        decoded = self._mav.decode(bytearray(frame))
-        message = read(decoded, (frame[5], frame[6]))
+        refusal = self._signing.refusal(frame, self._now()) if self._signing else None
+        if refusal is not None:
+            self._tally.refuse(refusal)
+            untimely = refusal in (AHEAD, BEHIND)
+            return self._untimely(frame, refusal == AHEAD) if untimely else None, True
+        message = self._read(frame, message_id)
         if isinstance(message, str):
             self._tally.refuse(message)
             return None, True
         return message, True
 
+    def _read(self, frame: bytes, message_id: int) -> Message | str | None:
+        """Return a frame's message, why it is refused, or None when nobody wants it."""
+        read = _READERS.get(message_id)
+        if read is None:
+            return None
+        # A layout's payload, cut or with unknown extensions, is padded or cut to its size.
+        return read(self._mav.decode(bytearray(frame)), (frame[5], frame[6]))
+
+    def _untimely(self, frame: bytes, ahead: bool) -> Untimely:
+        message_id = int.from_bytes(frame[7:10], "little")
+        is_timesync = message_id == dialect.MAVLINK_MSG_ID_TIMESYNC
+        said = self._read(frame, message_id) if is_timesync else None
+        timesync = said if isinstance(said, Timesync) else None
+        return Untimely(frame[5], frame[6], timestamp_of(frame), ahead, timesync)
+
     def _pack(self, message: Any) -> bytes:
         frame = bytes(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
         self._tally.messages_out += 1
-        return frame
+        if self._signing is None or not self._signing.signs:
+            return frame
+        return self._signed(self._signing, frame, message.crc_extra)
+
+    def _signed(self, signing: Signing, frame: bytes, crc_extra: int) -> bytes:
+        """Return a frame that says that it is signed, and is."""
+        body = frame[1:2] + bytes([SIGNED_FLAG]) + frame[3:-_CHECKSUM_BYTES]
+        checksum = int(dialect.x25crc(body + bytes([crc_extra])).crc)
+        whole = frame[:1] + body + checksum.to_bytes(_CHECKSUM_BYTES, "little")
+        return whole + signing.trailer(whole, self._now())
 
     def heartbeat(self, system_status: int) -> bytes:
         """Return a companion's HEARTBEAT with a MAV_STATE."""

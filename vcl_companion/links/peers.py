@@ -1,13 +1,19 @@
-"""The link to the other drones: heartbeats, TUNNEL payloads and the time, over one UDP socket."""
+"""The link to the other drones: signed heartbeats, TUNNELs and the time, over one UDP socket."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
+import secrets
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import dataclass
+from pathlib import Path
 
-from vcl_companion.clock import Clock
+from vcl_companion.clock import Clock, Moment, system_moment
+from vcl_companion.errors import ConfigError
 from vcl_companion.links.counters import LinkCounters, LinkTally
+from vcl_companion.links.kept_signing import KeptSigning
 from vcl_companion.links.mavlink import (
     COMPONENT_COMPANION,
     Codec,
@@ -15,9 +21,13 @@ from vcl_companion.links.mavlink import (
     Message,
     Timesync,
     Tunnel,
+    Untimely,
 )
 from vcl_companion.links.reconnect import Address
+from vcl_companion.links.signing import AHEAD, BEHIND, FORGED, NO_KEY, UNSIGNED, SigningOptions
 from vcl_companion.links.transport import open_peer_socket, parse_peers
+
+_log = logging.getLogger(__name__)
 
 _HEARTBEAT_S = 1.0
 # A member that was silent for longer may have moved to another address.
@@ -25,6 +35,17 @@ _ADDRESS_STALE_S = 5.0
 _STATE_ACTIVE = 4
 # Nobody who means it asks for the time more often.
 _LEAST_BETWEEN_ANSWERS_S = 0.1
+_QUESTION_BITS = 62
+# What an answer's own clock says is of no use to anybody; only a question's is 0.
+_ANSWERED = 1
+# Refusals that somebody should see to, and what it may be; told once each.
+_TELLING = {
+    UNSIGNED: "is a drone without a key?",
+    FORGED: "is the key the same on every drone?",
+    NO_KEY: "has this drone no key?",
+    AHEAD: "a drone's clock is ahead of ours",
+    BEHIND: "a drone's clock is behind ours",
+}
 
 
 @dataclass(frozen=True)
@@ -36,13 +57,41 @@ class PeerOptions:
             multicast group the address of the interface to join on.
         to: numeric IPv4 ADDRESS:PORT of every other drone, or one broadcast address, or
             one multicast group.
+        key_file: full path of the key that frames are signed with, the same on every drone;
+            empty for none.
+        timestamp_file: what signing remembers from one run to the next, a file for each
+            daemon; empty: nothing, for which the host needs a clock that is never wrong.
+        allow_unsigned: whether frames without a signature are taken.
     """
 
     listen: str = "0.0.0.0:14650"
     to: tuple[str, ...] = ()
+    key_file: str = ""
+    timestamp_file: str = "signing.json"
+    allow_unsigned: bool = False
 
     def __post_init__(self) -> None:
         parse_peers(self.listen, self.to)
+        if self.key_file and not Path(self.key_file).is_absolute():
+            raise ConfigError(f"key_file: a full path is needed, got {self.key_file!r}")
+        if self.to and not self.key_file and not self.allow_unsigned:
+            raise ConfigError(
+                "key_file: other drones in `to`, and no key to sign with: name a file here, "
+                "run `vcl keys new` once and `vcl keys install` on each drone; or set "
+                "allow_unsigned = true"
+            )
+
+
+def open_signing(options: PeerOptions, now: Callable[[], Moment] = system_moment) -> KeptSigning:
+    """Return the signing of the peer link, with its key and what the last run has left.
+
+    Raises:
+        ConfigError: the key cannot be used, or timestamps cannot be kept.
+    """
+    if options.allow_unsigned and options.to:
+        _log.warning("peers: frames are taken from whoever sends them (allow_unsigned)")
+    strictness = SigningOptions(allow_unsigned=options.allow_unsigned)
+    return KeptSigning(options.key_file, options.timestamp_file, strictness, now)
 
 
 class PeerLink:
@@ -56,6 +105,8 @@ class PeerLink:
         on_heartbeat: takes the system id of a member that has shown itself.
         clock: what members that ask for the time are told.
         on_time: takes a member's answer about the time: system id, ts1, tc1.
+        signing: of ``open_signing``.
+        disk: does the writing that signing needs; None: the loop's own executor.
     """
 
     def __init__(
@@ -67,6 +118,8 @@ class PeerLink:
         on_heartbeat: Callable[[int], None],
         clock: Clock,
         on_time: Callable[[int, int, int], None],
+        signing: KeptSigning,
+        disk: Executor | None = None,
     ) -> None:
         self._system_id = system_id
         self._members = members
@@ -74,11 +127,16 @@ class PeerLink:
         self._on_heartbeat = on_heartbeat
         self._clock = clock
         self._on_time = on_time
+        self._kept = signing
+        self._disk = disk
         self._tally = LinkTally()
-        self._codec = Codec(system_id, COMPONENT_COMPANION, self._tally)
+        self._codec = Codec(
+            system_id, COMPONENT_COMPANION, self._tally, signing.signing, signing.now
+        )
         self._socket = open_peer_socket(options.listen, options.to, self._tally)
         self._addresses: dict[int, tuple[Address, float]] = {}
         self._told_time_at_s: dict[int, float] = {}
+        self._told: set[str] = set()
 
     @property
     def counters(self) -> LinkCounters:
@@ -90,6 +148,7 @@ class PeerLink:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._socket.run(self._receive, self._beat))
             group.create_task(self._heartbeats())
+            group.create_task(self._kept.run(self._disk))
 
     def send(self, payload_type: int, payload: bytes, target_system: int = 0) -> None:
         """Send a TUNNEL of at most 128 bytes to one member, or to all (0).
@@ -120,6 +179,9 @@ class PeerLink:
             if refusal is not None:
                 self._tally.refuse(refusal)
                 continue
+            if isinstance(message, Untimely):
+                self._hear_time(message)
+                continue
             accepted = True
             # Only configured addresses are ever sent to, whatever claims to be a member.
             if sender is not None and sender in self._socket.destinations:
@@ -130,6 +192,8 @@ class PeerLink:
                     self._on_tunnel(message)
                 case Heartbeat():
                     self._on_heartbeat(message.sender_system)
+                case Timesync(ts1_ns=number) if number < 0:
+                    self._answer(message)
                 case Timesync(tc1_ns=0):
                     self._tell_time(message)
                 case Timesync():
@@ -147,6 +211,33 @@ class PeerLink:
             self._told_time_at_s[asker] = now_s
             self._send(self._codec.timesync(now_ns, question.ts1_ns, asker), asker)
 
+    def _hear_time(self, message: Untimely) -> None:
+        """Find out what time it is with a member that is not of our time (``swarm_time.py``)."""
+        now, time = self._kept.now(), self._kept.signing.time
+        said = message.timesync
+        if said is not None and said.tc1_ns == 0:
+            self._answer(said)
+        elif said is not None:
+            ahead_s = time.told(said.ts1_ns, message.timestamp, now)
+            if ahead_s is not None:
+                _log.warning(
+                    "the swarm is %.0f s ahead of us, drone %d says: its time is ours now",
+                    ahead_s,
+                    message.sender_system,
+                )
+                return
+        if message.ahead:
+            number = -1 - secrets.randbits(_QUESTION_BITS)
+            if time.asks(number, now):
+                self._socket.write(self._codec.timesync(0, number))
+
+    def _answer(self, said: Timesync) -> None:
+        """Repeat the number of a question about the swarm's time, signed; else say nothing."""
+        if said.tc1_ns != 0 or said.ts1_ns >= 0:
+            return
+        if self._kept.signing.time.answers(said.sender_system, self._kept.now()):
+            self._socket.write(self._codec.timesync(_ANSWERED, said.ts1_ns))
+
     def _refusal(self, message: Message) -> str | None:
         if message.sender_system == self._system_id:
             return "own echo"
@@ -155,7 +246,10 @@ class PeerLink:
         if message.sender_component != COMPONENT_COMPANION:
             return "not a companion"
         match message:
-            case Heartbeat():
+            case Heartbeat() | Untimely():
+                return None
+            # Below 0: of the swarm's time; no clock stands there.
+            case Timesync(ts1_ns=number) if number < 0 and self._kept.signing.signs:
                 return None
             case Tunnel(target_system=target):
                 return None if target in (0, self._system_id) else "tunnel for another system"
@@ -171,3 +265,11 @@ class PeerLink:
         while True:
             await asyncio.sleep(_HEARTBEAT_S)
             self._beat()
+            self._tell()
+
+    def _tell(self) -> None:
+        """Let the log say, once, what keeps drones from hearing each other."""
+        refused = self._tally.snapshot().refused
+        for reason in _TELLING.keys() & refused.keys() - self._told:
+            self._told.add(reason)
+            _log.warning("peers: a frame was refused: %s (%s)", reason, _TELLING[reason])

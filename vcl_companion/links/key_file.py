@@ -1,0 +1,136 @@
+"""Key files: the secret that a swarm signs with, made once and copied to every drone.
+
+A file is one line of 64 hexadecimal digits, 32 random bytes. The line is a passphrase as
+QGroundControl, MAVProxy and Mission Planner take it, and the key is, as with them, its
+SHA-256: a ground station is given the line.
+
+What goes wrong is told without a word of what is in the file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import secrets
+import stat
+from contextlib import suppress
+from pathlib import Path
+
+from vcl_companion.errors import ConfigError
+from vcl_companion.links.signing import SECRET_BYTES, SigningKey
+
+_PASSPHRASE = re.compile(rf"[0-9a-f]{{{2 * SECRET_BYTES}}}")
+_MAX_FILE_BYTES = 1024
+_FORBIDDEN = stat.S_IWGRP | stat.S_IXGRP | stat.S_IRWXO
+_PRIVATE, _SHARED_WITH_GROUP = 0o600, 0o640
+
+
+def make_key_file(path: Path) -> SigningKey:
+    """Write a new random key, for nobody but its owner to read, and return it.
+
+    Raises:
+        ConfigError: there is something already, which is left alone, or it cannot be written.
+    """
+    passphrase = secrets.token_hex(SECRET_BYTES)
+    try:
+        _write(path, passphrase, _PRIVATE)
+    except FileExistsError:
+        raise ConfigError(f"{path}: is there already; a key is never overwritten") from None
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: {_why(error)}") from error
+    return _key_of(passphrase)
+
+
+def read_key_file(path: Path) -> SigningKey:
+    """Return the key in a file.
+
+    Raises:
+        ConfigError: it cannot be read, others can read it, or it is no key file.
+    """
+    return _key_of(read_passphrase(path))
+
+
+def read_passphrase(path: Path) -> str:
+    """Return the secret line of a key file, for ground stations.
+
+    Raises:
+        ConfigError: as ``read_key_file``.
+    """
+    try:
+        with open(path, "rb", opener=_at_once) as file:
+            about = os.fstat(file.fileno())
+            if not stat.S_ISREG(about.st_mode):
+                raise ConfigError(f"{path}: is no file")
+            if about.st_mode & _FORBIDDEN:
+                raise ConfigError(
+                    f"{path}: others can read or change this key (mode "
+                    f"{stat.S_IMODE(about.st_mode):03o}); run `chmod 600 {path}`, and make a new "
+                    "key if somebody may have read it"
+                )
+            text = file.read(_MAX_FILE_BYTES + 1).decode("ascii", errors="replace").strip()
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: {_why(error)}") from error
+    if not _PASSPHRASE.fullmatch(text):
+        raise ConfigError(f"{path}: is no key file; `vcl keys new` makes one")
+    return text
+
+
+def install_key_file(source: Path, target: Path, like: Path | None = None) -> SigningKey:
+    """Copy a key to where a daemon looks for it, in place of one that may be there.
+
+    Args:
+        source: the key file.
+        target: the file that it becomes.
+        like: a file, the daemon's configuration, that gives the copy owner and group: who
+            can read it is to read the key. Its group can only if others cannot read that
+            file either. None: only the user who runs this.
+
+    Returns:
+        The key.
+
+    Raises:
+        ConfigError: the source is no key file, or the target cannot be written.
+    """
+    passphrase = read_passphrase(source)
+    partial = target.with_name(f".{target.name}.partial")
+    try:
+        about = None if like is None else like.stat()
+        with suppress(FileNotFoundError):
+            partial.unlink()
+        _write(partial, passphrase, _PRIVATE)
+        try:
+            if about is not None:
+                os.chown(partial, about.st_uid, about.st_gid)
+                readers = about.st_mode & (stat.S_IRGRP | stat.S_IROTH)
+                os.chmod(partial, _SHARED_WITH_GROUP if readers == stat.S_IRGRP else _PRIVATE)
+            partial.replace(target)
+        except OSError:
+            partial.unlink(missing_ok=True)
+            raise
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{target}: cannot be installed ({_why(error)})") from error
+    return _key_of(passphrase)
+
+
+def _at_once(path: str, flags: int) -> int:
+    """Open without waiting: a pipe of that name may have nobody at its other end."""
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
+def _write(path: Path, passphrase: str, mode: int) -> None:
+    """Write a file that is not there yet, and that nobody else could read for a moment."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+    with open(descriptor, "w", encoding="ascii") as file:
+        os.fchmod(descriptor, mode)  # whatever the umask
+        file.write(passphrase + "\n")
+        file.flush()
+        os.fsync(descriptor)
+
+
+def _key_of(passphrase: str) -> SigningKey:
+    return SigningKey(hashlib.sha256(passphrase.encode("ascii")).digest())
+
+
+def _why(error: OSError | ValueError) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
