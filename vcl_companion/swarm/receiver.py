@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from vcl_companion.swarm.repairs import n_blocks
 from vcl_companion.swarm.transfer_options import Pace
 
 _BACKOFF = 1.25
@@ -14,8 +15,8 @@ _BACKOFF = 1.25
 _LEAST_ASKS = 30
 _MAX_SENDS_PER_CHUNK = 100  # at 95 % loss twenty are expected
 _MIN_SENDS = 1000
-# Before anything can be sent to all, each has to hear that it is meant: asked often, a few times.
-_OPENING_TRIES = 4
+# While others wait for its answer it is asked often, a few times.
+_SHORT_TRIES = 4
 
 
 class Receiver:
@@ -27,6 +28,8 @@ class Receiver:
         self.transfer_id = transfer_id
         self.peer = peer
         self.arrived = np.zeros(n_chunks, dtype=np.bool_)
+        # Of each block: how much will have been sent of it when it can have enough.
+        self.goal = np.zeros(n_blocks(n_chunks), dtype=np.int64)
         self.newest_answer = 0  # segment of the ask that it answered
         self.is_open = False  # it has said what it has, so it takes what is sent to all
         self.is_busy = False
@@ -36,7 +39,7 @@ class Receiver:
         self._pace = pace
         self._rng = rng
         self._backoff = 1.0
-        self._n_asked = 0  # in vain so far
+        self.n_asked = 0  # in vain so far
         self._n_arrived = 0
         self._n_sent = 0
         self._progress_at_s: float | None = None  # None until something was sent to it
@@ -49,8 +52,7 @@ class Receiver:
     @property
     def is_awaited(self) -> bool:
         """Whether an answer is about to come, as far as one can tell."""
-        silent = self._backoff > 1.0 if self.is_open else self._n_asked >= _OPENING_TRIES
-        return self.owes_answer and not silent
+        return self.owes_answer and self.n_asked < _SHORT_TRIES
 
     def gives_up_at_s(self) -> float:
         """Return when patience ends if nothing progresses until then."""
@@ -74,15 +76,15 @@ class Receiver:
 
     def asked_alone(self) -> None:
         """Note that it was asked by itself, since it had not answered."""
-        self._n_asked += 1
+        self.n_asked += 1
         most_s = max(self._pace.give_up_s / _LEAST_ASKS, self._pace.status_interval_s)
         self._backoff = min(_BACKOFF * self._backoff, most_s / self._pace.status_interval_s)
 
-    def wait_for_first(self, now_s: float) -> None:
-        """Wait a short while for the first answer, the first few times; then as usual."""
+    def wait_shortly(self, now_s: float) -> None:
+        """Wait for the first answer, which others wait for; after a few times as usual."""
         self.wait(now_s)
-        if self._n_asked <= _OPENING_TRIES:
-            self.ask_again_at_s = now_s + self._pace.status_interval_s / _OPENING_TRIES
+        if self.n_asked <= _SHORT_TRIES:
+            self.ask_again_at_s = now_s + self._pace.status_interval_s / _SHORT_TRIES
 
     def wait(self, now_s: float) -> None:
         """Wait for an answer; the jitter keeps many senders from asking in step."""
@@ -90,11 +92,17 @@ class Receiver:
         self.ask_again_at_s = now_s + interval_s * float(self._rng.uniform(0.9, 1.1))
 
     def answered(self, now_s: float) -> None:
-        """Note a look at what it has; ``arrived`` is up to date."""
+        """Note a look at what it has."""
         self.is_open, self.is_busy, self.owes_answer = True, False, False
-        self._backoff, self._n_asked = 1.0, 0
-        n_arrived = int(self.arrived.sum())
-        if n_arrived > self._n_arrived:
-            self._progress_at_s = now_s
-        self._n_arrived = n_arrived
+        self._backoff, self.n_asked = 1.0, 0
         self.obstacle = "no progress"
+
+    def share_arrived(self, n_sent: int) -> float:
+        """Return how much of what was sent has arrived, at most 1: as far as one can tell."""
+        return min(self._n_arrived / max(n_sent, 1), 1.0) if self._n_arrived > 1 else 1.0
+
+    def has(self, n_chunks: int, now_s: float) -> None:
+        """Note how much it has, which is progress if it is more than before."""
+        if n_chunks > self._n_arrived:
+            self._progress_at_s = now_s
+        self._n_arrived = n_chunks

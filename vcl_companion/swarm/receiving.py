@@ -15,15 +15,22 @@ from dataclasses import dataclass, replace
 
 from vcl_companion.errors import WireError
 from vcl_companion.swarm.budget import MAX_FRAME_BYTES, ByteBudget
-from vcl_companion.swarm.reassembly import CHUNK_COST_BYTES, FIXED_COST_BYTES, Incoming
+from vcl_companion.swarm.reassembly import (
+    CHUNK_COST_BYTES,
+    FIXED_COST_BYTES,
+    SUM_COST_BYTES,
+    Incoming,
+)
 from vcl_companion.swarm.transfer_options import TransferOptions
 from vcl_companion.wire.chunks import (
     CHUNK_DATA_BYTES,
+    FIRST_SUM,
     Chunk,
     Descriptor,
     Reply,
     TransferStatus,
     decode_descriptor,
+    lacking_statuses,
     receiving_statuses,
 )
 from vcl_companion.wire.header import BlobKind
@@ -110,7 +117,7 @@ class Receptions:
     ) -> list[ReceptionEvent]:
         """Take in a chunk that was sent to us, or to all; return what ended by it."""
         key = (peer, chunk.tag)
-        if to_all and key not in self._incoming:
+        if to_all and not self._is_begun(key):
             return []
         settled = self._settled.get(key)
         if settled is not None and now_s < settled.until_s:
@@ -121,6 +128,7 @@ class Receptions:
         events: list[ReceptionEvent] = []
         incoming = self._open(key, now_s, events)
         if incoming is not None:
+            incoming.is_for_several |= to_all
             self._store(key, incoming, chunk, now_s, events)
         if key in self._settled:
             self._owe(key, _Answer(now_s, now_s, max(chunk.ask, 1)))  # news: no need to be asked
@@ -206,6 +214,11 @@ class Receptions:
             self._answer_budgets[peer] = ByteBudget(rate, burst_bytes)
         return self._answer_budgets[peer]
 
+    def _is_begun(self, key: _Key) -> bool:
+        """Whether an unfinished blob is meant for us, and which chunks it has."""
+        incoming = self._incoming.get(key)
+        return incoming is not None and incoming.descriptor is not None
+
     def _open(self, key: _Key, now_s: float, events: list[ReceptionEvent]) -> Incoming | None:
         """Return the unfinished blob of a chunk, a new one if need be; None if too many are."""
         incoming = self._incoming.get(key)
@@ -239,12 +252,18 @@ class Receptions:
             if descriptor.length_bytes > self._options.max_blob_bytes:
                 events.append(self._refuse(key, Reply.TOO_LARGE, "longer than allowed", now_s))
                 return
+        is_sum = chunk.index >= FIRST_SUM
+        if is_sum and descriptor is None:
+            incoming.heard_at_s = now_s
+            return
         # Without a descriptor nobody knows which chunk is the last, the only one that is short.
-        full = CHUNK_DATA_BYTES if descriptor is None else descriptor.chunk_bytes(chunk.index)
+        full = CHUNK_DATA_BYTES
+        if descriptor is not None and not is_sum:
+            full = descriptor.chunk_bytes(chunk.index)
         if len(chunk.data) != full:
             return
         room = incoming.room_for(chunk.index + 1) if descriptor is None else descriptor.n_chunks
-        more_bytes = (room - len(incoming.arrived)) * CHUNK_COST_BYTES
+        more_bytes = (room - len(incoming.arrived)) * CHUNK_COST_BYTES + is_sum * SUM_COST_BYTES
         incoming.starved = not self._fits(key, more_bytes, now_s, events)
         if incoming.starved:
             return
@@ -254,7 +273,10 @@ class Receptions:
             self._newest[key[0], _ONE_AT_A_TIME.get(descriptor.kind, descriptor.kind)] = key[1]
         incoming.descriptor = descriptor
         incoming.make_room(room)
-        incoming.put(chunk)
+        if is_sum and descriptor is not None:
+            incoming.put_sum(chunk, descriptor.n_chunks)
+        else:
+            incoming.put(chunk)
         incoming.heard_at_s = now_s
         if descriptor is not None and incoming.n_arrived == descriptor.n_chunks:
             self._finish(key, incoming, descriptor, now_s, events)
@@ -363,6 +385,8 @@ class Receptions:
         incoming = self._incoming.get(key)
         if incoming is None or incoming.starved:
             return [TransferStatus(tag, Reply.BUSY, ask)]
+        if incoming.is_for_several and incoming.descriptor is not None:
+            return list(lacking_statuses(tag, ask, incoming.lacking_counts()))
         statuses = receiving_statuses(tag, ask, incoming.known_end(), incoming.missing())
         return list(itertools.islice(statuses, _MAX_STATUSES))
 
