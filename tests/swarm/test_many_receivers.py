@@ -67,6 +67,23 @@ def test_where_no_network_is_shared_each_is_sent_its_own() -> None:
 
 @pytest.mark.parametrize("options", [DEFAULTS, RADIO], ids=["wifi", "radio-57k"])
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("n_receivers", [1, 3])
+def test_twenty_percent_loss_takes_at_most_1_4_times_the_bytes(
+    options: TransferOptions, seed: int, n_receivers: int
+) -> None:
+    """Of the blob itself, once, however many get it: headers, sums and statuses all count.
+
+    Repeating what any of three lacks takes 1.63 * 128 / 119 = 1.76 times at the least.
+    """
+    network = group(n_receivers, Weather(loss=0.2), options, seed)
+    peers = range(2, n_receivers + 2)
+    send(network, BLOB, *peers)
+    assert all(network.blobs(peer) == [BLOB] for peer in peers)
+    assert 1.3 < network.n_bytes / len(BLOB) < 1.4
+
+
+@pytest.mark.parametrize("options", [DEFAULTS, RADIO], ids=["wifi", "radio-57k"])
+@pytest.mark.parametrize("seed", range(3))
 def test_half_of_all_lost_still_finishes_for_one_and_for_three(
     options: TransferOptions, seed: int
 ) -> None:
@@ -212,3 +229,11 @@ def test_it_is_deterministic() -> None:
         send(network, BLOB, 2, 3, 4)
         runs.append((network.n_bytes, network.now_s, network.log))
     assert runs[0] == runs[1]
+
+
+def test_what_is_too_long_for_one_answer_arrives_too() -> None:
+    network = group(2, Weather(loss=0.02), TransferOptions(rate_bytes_per_s=4e6))
+    blob = np.random.default_rng(1).bytes(60 * 1024 * 119)  # 61 blocks
+    send(network, blob, 2, 3)
+    assert [network.blobs(peer) == [blob] for peer in (2, 3)] == [True, True]
+    assert network.n_bytes < 1.2 * len(blob)

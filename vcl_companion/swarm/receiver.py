@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from vcl_companion.swarm.repairs import n_blocks
+from vcl_companion.swarm.repairs import n_blocks, per_block
 from vcl_companion.swarm.transfer_options import Pace
 
 _BACKOFF = 1.25
@@ -30,6 +30,7 @@ class Receiver:
         self.arrived = np.zeros(n_chunks, dtype=np.bool_)
         # Of each block: how much will have been sent of it when it can have enough.
         self.goal = np.zeros(n_blocks(n_chunks), dtype=np.int64)
+        self.lacking = per_block(~self.arrived)  # of each block, by its own count
         self.newest_answer = 0  # segment of the ask that it answered
         self.is_open = False  # it has said what it has, so it takes what is sent to all
         self.is_busy = False

@@ -7,11 +7,11 @@ the number, so that a chunk counts as lost only if it was sent before the ask
 that the answer answers. An answer that stays out is asked for again, ever more
 rarely, until the sender gives up.
 
-To several receivers a chunk goes once, to all, unless a single one lacks it; when
-each lacks others, sums go in their place (``repairs``). Each is first sent the
-beginning by itself: only a stream that began so is meant for it. When all has been
-sent once, what is missing is repeated as soon as all have answered. Who does not
-answer holds the others up for no longer than a few status intervals.
+To several receivers a chunk goes once, to all, unless a single one lacks it. What
+is lost is not repeated: each loses other chunks, and sums of many help them all
+(``repairs``); so they only tell how many they lack. Each is first sent the beginning
+by itself: only a stream that began so is meant for it. Who does not answer then holds
+the others up for no longer than a status interval.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ from vcl_companion.wire.chunks import (
 
 ALL = 0  # the target of what everybody hears
 _ASK_EVERY_INTERVALS = 5.0  # while there is still something to send
+_ASK_SEVERAL_INTERVALS = 2.0  # their answers are short, and nobody is asked alone meanwhile
 # Several answer one ask one after the other.
 _MERGE_SHARE = 0.25  # of the status interval
 # However much is lost, no more is sent at once than twice of what is lacking.
@@ -278,7 +279,8 @@ class Sending:
 
     def _is_time_to_ask(self, now_s: float) -> bool:
         """Whether to ask with what was just taken: the last, or after a while."""
-        every_s = _ASK_EVERY_INTERVALS * self._pace.status_interval_s
+        intervals = _ASK_SEVERAL_INTERVALS if self._is_for_several else _ASK_EVERY_INTERVALS
+        every_s = intervals * self._pace.status_interval_s
         return not self._is_due() or now_s - self._asked_at_s >= every_s
 
     def _target(self, lacking: list[Receiver], asks: bool) -> int:
@@ -355,9 +357,9 @@ class Sending:
         receiver.answered(now_s)
         self._is_for_several = True  # it thinks so: somebody else was meant, too, before
         blocks = slice(status.first, status.end)
-        if len(status.counts) == len(receiver.goal):
-            receiver.has(len(self._waiting) - sum(status.counts), now_s)
-        self._aim(receiver, now_s, status.ask, blocks, np.array(status.counts, dtype=np.int64))
+        receiver.lacking[blocks] = status.counts
+        receiver.has(len(self._waiting) - int(receiver.lacking.sum()), now_s)
+        self._aim(receiver, now_s, status.ask, blocks, receiver.lacking[blocks])
         if not self._is_due():
             receiver.wait(now_s)
 
