@@ -230,7 +230,8 @@ class Sending:
         takers = [r.goal for r in self._receivers.values() if r.is_open and not r.is_busy]
         if not (self._is_for_several and takers):
             return np.zeros_like(self._n_sent_of)
-        return np.maximum.reduce(takers) - self._n_sent_of - self._n_waiting_of
+        goal: Counts = np.maximum.reduce(takers)
+        return goal - self._n_sent_of - self._n_waiting_of
 
     def _next_waiting(self) -> tuple[int, list[Receiver]]:
         """Take the lowest chunk that waits; and who lacks it."""
