@@ -238,6 +238,19 @@ def test_a_burst_of_a_map_is_not_lost_while_the_receiver_is_busy(key: str) -> No
 
 
 @pytest.mark.parametrize(
+    ("to", "n_copies"),
+    [
+        (("239.0.0.1:14650",), 1),
+        (("192.168.1.255:14650",), 1),
+        (("127.0.0.1:1", "127.0.0.1:2"), 2),
+        ((), 0),
+    ],
+)
+def test_it_is_known_how_often_a_message_to_all_is_sent(to: tuple[str, ...], n_copies: int) -> None:
+    assert Drone(PeerOptions("0.0.0.0:14650", to), 1).link.copies_to_all == n_copies
+
+
+@pytest.mark.parametrize(
     ("listen", "to"),
     [("0.0.0.0", ()), ("drone:14650", ()), ("0.0.0.0:1", ("::1:14650",)),
      ("[::]:1", ("[::1]:14650",)), ("0.0.0.0:1", ("127.0.0.1:0",)),

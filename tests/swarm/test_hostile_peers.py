@@ -5,11 +5,13 @@ from __future__ import annotations
 import tracemalloc
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.swarm.network import Network
 from tests.wire.strategies import chunks, statuses
+from vcl_companion.swarm.budget import FRAME_OVERHEAD_BYTES
 from vcl_companion.swarm.transfer import (
     BlobKind,
     BlobReceived,
@@ -141,7 +143,7 @@ def test_a_peer_that_never_has_enough_is_given_up() -> None:
 
 
 def test_answers_of_a_stranger_change_nothing() -> None:
-    network = Network(options=TransferOptions(rate_bytes_per_s=2_000.0, burst_bytes=128))
+    network = Network(options=TransferOptions(rate_bytes_per_s=2_000.0, burst_bytes=158))
     sender = network.add(1)
     network.add(2)
     sender.submit(2, BlobKind.MAP, BLOB, network.now_s)
@@ -221,3 +223,85 @@ def test_any_messages_between_honest_ones_do_no_harm(
     network.run(500.0)
     assert network.blobs(2) == [BLOB]
     assert network.drones[2].incoming_memory_bytes == 0
+
+
+def beginning(kind: BlobKind, blob: bytes) -> Chunk:
+    descriptor = describe(kind, blob)
+    return Chunk(descriptor.tag, 0, 0, descriptor.cut(blob, 0))
+
+
+@pytest.mark.parametrize(
+    ("older", "newer"),
+    [
+        (BlobKind.MAP, BlobKind.MAP_UPDATE),
+        (BlobKind.MAP_UPDATE, BlobKind.MAP),
+        (BlobKind.POSE_REQUEST, BlobKind.POSE_REQUEST),
+        (BlobKind.FRAME_ANSWER, BlobKind.FRAME_ANSWER),
+    ],
+)
+def test_what_a_sender_began_before_its_newest_is_dropped_when_silent(
+    older: BlobKind, newer: BlobKind
+) -> None:
+    transfers = transfers_with(TransferOptions())
+    transfers.receive(1, beginning(older, BLOB), 0.0)
+    transfers.receive(2, beginning(older, BLOB), 0.0)  # another sender's, which it still means
+    transfers.receive(1, beginning(newer, BLOB[1:]), 1.0)
+    assert transfers.poll(1.9) == ([], [])
+    assert transfers.next_poll_s() == 2.0
+    assert transfers.poll(2.0)[1] == [
+        ReceptionAbandoned(1, older, "its sender has begun a newer one")
+    ]
+    assert transfers.poll(60.0) == ([], [])
+
+
+def test_frames_that_are_passed_on_come_several_at_a_time() -> None:
+    transfers = transfers_with(TransferOptions())
+    for k in range(3):
+        transfers.receive(1, beginning(BlobKind.PASSED_FRAME, BLOB[k:]), 0.0)
+    assert transfers.poll(60.0) == ([], [])
+
+
+def test_an_older_map_that_still_comes_in_is_kept() -> None:
+    transfers = transfers_with(TransferOptions())
+    transfers.receive(1, beginning(BlobKind.MAP, BLOB), 0.0)
+    transfers.receive(1, beginning(BlobKind.MAP, BLOB[1:]), 0.1)
+    descriptor = describe(BlobKind.MAP, BLOB)
+    events: list[Event] = []
+    for index in range(1, descriptor.n_chunks):
+        assert transfers.poll(float(index))[1] == (
+            [ReceptionAbandoned(1, BlobKind.MAP, "nothing came for 120 s")] if index > 120 else []
+        )
+        chunk = Chunk(descriptor.tag, index, 0, descriptor.cut(BLOB, index))
+        events += transfers.receive(1, chunk, float(index))
+    assert events == [BlobReceived(1, BlobKind.MAP, BLOB)]
+
+
+def test_who_asks_all_the_time_gets_a_quarter_of_what_may_be_said() -> None:
+    options = TransferOptions(profile="radio-57k")
+    transfers = transfers_with(options)
+    n_bytes, ends_s = {1: 0, 2: 0}, 100.0
+    answered: list[float] = []
+    whole = describe(BlobKind.MAP, BLOB)
+    for index in range(whole.n_chunks):
+        transfers.receive(1, Chunk(whole.tag, index, 0, whole.cut(BLOB, index)), 0.0)
+    for step in range(10_000):
+        now_s = step * ends_s / 10_000
+        transfers.receive(1, full_chunk(step % 50, 3, ask=1), now_s)
+        transfers.receive(1, Chunk(whole.tag, 0, 1, whole.cut(BLOB, 0)), now_s)
+        if step % 100 == 0:
+            transfers.receive(2, full_chunk(7, step // 100, ask=1), now_s)
+        for sent in transfers.poll(now_s)[0]:
+            n_bytes[sent.peer] += len(sent.payload) + FRAME_OVERHEAD_BYTES
+            answered += [now_s] if sent.peer == 2 else []
+    assert 0.2 < n_bytes[1] / (options.pace.rate_bytes_per_s * ends_s) < 0.3
+    assert len(answered) > 60
+
+
+def test_what_is_sent_to_all_begins_nothing() -> None:
+    transfers = transfers_with(TransferOptions())
+    descriptor = describe(BlobKind.MAP, BLOB)
+    for index in range(descriptor.n_chunks):
+        chunk = Chunk(descriptor.tag, index, 1, descriptor.cut(BLOB, index))
+        assert transfers.receive(1, chunk, 0.0, to_all=True) == []
+    assert transfers.incoming_memory_bytes == 0
+    assert transfers.next_poll_s() is None

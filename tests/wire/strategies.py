@@ -31,8 +31,17 @@ def _windows(draw: st.DrawFn) -> TransferStatus:
     return TransferStatus(draw(_tags), Reply.RECEIVING, draw(_asks), cuts[0], cuts[-1], pairs[:18])
 
 
+@st.composite
+def _counts(draw: st.DrawFn) -> TransferStatus:
+    first = draw(st.integers(0, 60))
+    counts = tuple(draw(st.lists(st.integers(0, 1024), min_size=1, max_size=59)))
+    end = first + len(counts)
+    return TransferStatus(draw(_tags), Reply.LACKING, draw(_asks), first, end, counts=counts)
+
+
 statuses = st.one_of(
     _windows(),
+    _counts(),
     st.builds(
         TransferStatus,
         tag=_tags,

@@ -10,7 +10,7 @@ from tests.wire.golden import assert_golden
 from tests.wire.samples import small_proposal
 from tests.wire.strategies import payload_values
 from vcl_companion.errors import WireError
-from vcl_companion.wire.chunks import CHUNK_DATA_BYTES, Chunk, Reply, TransferStatus
+from vcl_companion.wire.chunks import CHUNK_DATA_BYTES, FIRST_SUM, Chunk, Reply, TransferStatus
 from vcl_companion.wire.header import PROTOCOL_VERSION, PayloadKind, VersionMismatchError
 from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
 from vcl_companion.wire.pose_messages import PoseRefused
@@ -28,6 +28,10 @@ _GOLDEN: dict[str, TunnelPayload] = {
         0xCAFE, Reply.RECEIVING, 9, 10, 70_000, ((10, 11), (300, 500), (69_999, 70_000))
     ),
     "status_complete": TransferStatus(0xCAFE, Reply.COMPLETE, 127, digest=bytes(range(8))),
+    "chunk_sum": Chunk(0x12345678, FIRST_SUM + 1000, 0, bytes(range(119))),
+    "status_lacking": TransferStatus(
+        0xCAFE, Reply.LACKING, 9, first=2, end=6, counts=(0, 127, 128, 1024)
+    ),
     "status_busy": TransferStatus(0xCAFE, Reply.BUSY, 1),
     "frame_request": FrameRequest(77, 123_456_789_012, 0.125),
     "map_state": MapState(bytes(range(8)), 1000, True, 517, False),

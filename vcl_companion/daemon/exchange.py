@@ -50,12 +50,13 @@ from vcl_companion.swarm.transfer import (
     Transfers,
 )
 from vcl_companion.swarm.updates import OwnVote, Sight, UpdateOptions
+from vcl_companion.swarm.urgency import Message
 from vcl_companion.vision.features import Detector
 from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.frame_codec import decode_frame
 from vcl_companion.wire.messages import MAX_TRACKED, FrameRequest, MapRefused, MapState
 from vcl_companion.wire.pose_messages import PoseProposal, PoseRefused
-from vcl_companion.wire.tunnel import TunnelPayload, decode_payload, encode_payload, is_ours
+from vcl_companion.wire.tunnel import TunnelPayload, decode_payload, is_ours
 
 _log = logging.getLogger(__name__)
 
@@ -215,6 +216,7 @@ class Exchange:
     def attach(self, link: PeerLink) -> None:
         """Give the link to speak on; it calls what begins with ``on``, and ``clocks``."""
         self._link = link
+        self._transfers.reaches_all_with(link.copies_to_all)
 
     def on_frame(self, frame: Frame) -> None:
         """Keep a frame of our own for peers, and for a first map."""
@@ -233,7 +235,7 @@ class Exchange:
         except WireError as error:
             self._refusals.count(tunnel.sender_system, "payload", str(error))
             return
-        self._accept(tunnel.sender_system, message)
+        self._accept(tunnel.sender_system, message, to_all=tunnel.target_system == 0)
         self._wake.set()
 
     async def run(self) -> None:
@@ -264,11 +266,11 @@ class Exchange:
                 async with asyncio.timeout(pause_s):
                     await self._wake.wait()
 
-    def _accept(self, peer: int, message: TunnelPayload) -> None:
+    def _accept(self, peer: int, message: TunnelPayload, *, to_all: bool) -> None:
         now_s = self._now_s()
         match message:
             case Chunk() | TransferStatus():
-                self._take_events(self._transfers.receive(peer, message, now_s))
+                self._take_events(self._transfers.receive(peer, message, now_s, to_all=to_all))
             case MapState():
                 before = self._group.state_of(peer)
                 if before is not None and before.revision and not message.revision:
@@ -390,9 +392,10 @@ class Exchange:
                 self._link.send(payload.payload_type, payload.payload, payload.peer)
         self._take_events(events)
 
-    def _send(self, message: TunnelPayload, peer: int) -> None:
-        if self._link is not None:
-            self._link.send(*encode_payload(message), peer)
+    def _send(self, message: Message, peer: int) -> None:
+        """Have a message to a peer, or to all (0), go before all that is less urgent."""
+        self._transfers.post(peer, message)
+        self._wake.set()
 
     def _ask_time(self, ts1_ns: int, peer: int) -> None:
         if self._link is not None:

@@ -143,6 +143,11 @@ class PeerLink:
         """What went over the link so far."""
         return self._tally.snapshot()
 
+    @property
+    def copies_to_all(self) -> int:
+        """How often a message to everybody is sent; once, where the group shares a network."""
+        return len(self._socket.destinations)
+
     async def run(self) -> None:
         """Keep the link alive until cancelled."""
         async with asyncio.TaskGroup() as group:

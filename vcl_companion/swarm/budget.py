@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from vcl_companion.wire.header import MAX_PAYLOAD_BYTES
 
+# What goes over the link around a payload: 12 bytes of MAVLink 2, 5 of TUNNEL's own fields
+# and 13 of a signature, which is counted whether there is one or not.
+FRAME_OVERHEAD_BYTES = 30
+MAX_FRAME_BYTES = MAX_PAYLOAD_BYTES + FRAME_OVERHEAD_BYTES
+
 
 class ByteBudget:
     """A token bucket; one payload may always go once there is room for the longest."""
@@ -24,14 +29,14 @@ class ByteBudget:
     def allows_one(self) -> bool:
         """Return whether one payload may go now."""
         # One byte of slack: at ``ready_at_s`` rounding must not ask for one more wait.
-        return self._bytes > MAX_PAYLOAD_BYTES - 1
+        return self._bytes > MAX_FRAME_BYTES - 1
 
-    def spend(self, n_bytes: int) -> None:
-        """Take what was sent."""
-        self._bytes -= n_bytes
+    def spend(self, payload_bytes: int, copies: int = 1) -> None:
+        """Take what a payload is on the link, so often."""
+        self._bytes -= copies * (payload_bytes + FRAME_OVERHEAD_BYTES)
 
     def ready_at_s(self) -> float:
         """Return when one payload may go; minus infinity if it may already."""
         if self._at_s is None or self.allows_one():
             return float("-inf")
-        return self._at_s + (MAX_PAYLOAD_BYTES - self._bytes) / self._rate_bytes_per_s
+        return self._at_s + (MAX_FRAME_BYTES - self._bytes) / self._rate_bytes_per_s

@@ -3,7 +3,8 @@
 A receiver only ever answers: it sends nothing that a chunk did not ask for. It
 keeps an unfinished blob for a while, so that a sender that comes back (after a
 gap, or restarted) goes on where it was, and remembers finished ones, so that
-late chunks do not begin them anew.
+late chunks do not begin them anew. A blob begins with a chunk that was sent to
+us alone: of what is sent to all, the rest is not meant for us, and costs nothing.
 """
 
 from __future__ import annotations
@@ -13,18 +14,27 @@ import math
 from dataclasses import dataclass, replace
 
 from vcl_companion.errors import WireError
-from vcl_companion.swarm.reassembly import CHUNK_COST_BYTES, FIXED_COST_BYTES, Incoming
+from vcl_companion.swarm.budget import MAX_FRAME_BYTES, ByteBudget
+from vcl_companion.swarm.reassembly import (
+    CHUNK_COST_BYTES,
+    FIXED_COST_BYTES,
+    SUM_COST_BYTES,
+    Incoming,
+)
 from vcl_companion.swarm.transfer_options import TransferOptions
 from vcl_companion.wire.chunks import (
     CHUNK_DATA_BYTES,
+    FIRST_SUM,
     Chunk,
     Descriptor,
     Reply,
     TransferStatus,
     decode_descriptor,
+    lacking_statuses,
     receiving_statuses,
 )
 from vcl_companion.wire.header import BlobKind
+from vcl_companion.wire.tunnel import encode_payload
 
 _MAX_DAMAGED = 3  # whole blobs with a wrong hash before a transfer is refused
 _MAX_STATUSES = 8  # payloads in one answer
@@ -32,6 +42,17 @@ _MAX_SETTLED = 1024  # remembered finished transfers, of all peers
 _MAX_ANSWERS = 256  # answers owed at one time, to all peers
 _QUIET_SHARE = 0.1  # of the status interval: no chunk for this long, and an answer goes out
 _IDLE_SHARE = 0.25  # of the give-up time: silent for this long, and memory may be taken
+# Of the budget, for answers to one peer: who asks all the time shall not have all of it.
+_ANSWERS_SHARE = 0.25
+# A sender that still means a blob asks every five status intervals at the least.
+_SUPERSEDED_INTERVALS = 10.0
+# Of these a sender has one for us at a time, the newest; a map is sent in one form of two.
+_ONE_AT_A_TIME = {
+    BlobKind.MAP: BlobKind.MAP,
+    BlobKind.MAP_UPDATE: BlobKind.MAP,
+    BlobKind.FRAME_ANSWER: BlobKind.FRAME_ANSWER,
+    BlobKind.POSE_REQUEST: BlobKind.POSE_REQUEST,
+}
 
 _Key = tuple[int, int]  # peer, tag
 
@@ -83,15 +104,21 @@ class Receptions:
         self._incoming: dict[_Key, Incoming] = {}
         self._settled: dict[_Key, _Settled] = {}
         self._answers: dict[_Key, _Answer] = {}
+        self._answer_budgets: dict[int, ByteBudget] = {}  # by peer
+        self._newest: dict[tuple[int, BlobKind], int] = {}  # tag of what a peer began last
 
     @property
     def memory_bytes(self) -> int:
         """Memory that unfinished blobs take."""
         return sum(incoming.cost_bytes for incoming in self._incoming.values())
 
-    def receive(self, peer: int, chunk: Chunk, now_s: float) -> list[ReceptionEvent]:
-        """Take in a chunk; return what ended by it."""
+    def receive(
+        self, peer: int, chunk: Chunk, now_s: float, *, to_all: bool = False
+    ) -> list[ReceptionEvent]:
+        """Take in a chunk that was sent to us, or to all; return what ended by it."""
         key = (peer, chunk.tag)
+        if to_all and not self._is_begun(key):
+            return []
         settled = self._settled.get(key)
         if settled is not None and now_s < settled.until_s:
             if chunk.ask:
@@ -101,6 +128,7 @@ class Receptions:
         events: list[ReceptionEvent] = []
         incoming = self._open(key, now_s, events)
         if incoming is not None:
+            incoming.is_for_several |= to_all
             self._store(key, incoming, chunk, now_s, events)
         if key in self._settled:
             self._owe(key, _Answer(now_s, now_s, max(chunk.ask, 1)))  # news: no need to be asked
@@ -120,7 +148,7 @@ class Receptions:
         return any(
             incoming.descriptor is not None
             and incoming.descriptor.kind == kind
-            and now_s - incoming.heard_at_s < self._options.give_up_s
+            and now_s - incoming.heard_at_s < self._options.pace.give_up_s
             for incoming in self._incoming.values()
         )
 
@@ -128,24 +156,68 @@ class Receptions:
         """Return the (peer, status) that are due; what is returned counts as sent."""
         out: list[tuple[int, TransferStatus]] = []
         for key in [key for key, answer in self._answers.items() if answer.due_s <= now_s]:
+            budget = self._answer_budget(key[0])
+            budget.refill(now_s)
+            if not budget.allows_one():
+                continue
             answer = self._answers.pop(key)
-            out += [(key[0], status) for status in self._statuses(key, answer.ask)]
+            for status in self._statuses(key, answer.ask):
+                budget.spend(len(encode_payload(status)[1]))
+                out.append((key[0], status))
             if key in self._incoming:
                 self._incoming[key].answered_at_s = now_s
         return out
 
     def expire(self, now_s: float) -> list[ReceptionEvent]:
         """Drop unfinished blobs that nobody goes on with."""
-        keep_s = self._options.keep_partial_s
-        old = [key for key, i in self._incoming.items() if now_s >= i.heard_at_s + keep_s]
-        return [self._abandon(key, f"nothing came for {keep_s:g} s") for key in old]
+        old = [key for key in self._incoming if now_s >= self._expires_at_s(key)]
+        return [
+            self._abandon(
+                key,
+                "its sender has begun a newer one"
+                if self._is_superseded(key)
+                else f"nothing came for {self._options.keep_partial_s:g} s",
+            )
+            for key in old
+        ]
 
     def next_s(self) -> float:
         """Return when an answer is due or a blob expires; infinity for never."""
-        due = [answer.due_s for answer in self._answers.values()]
+        due = [
+            max(answer.due_s, self._answer_budget(peer).ready_at_s())
+            for (peer, _), answer in self._answers.items()
+        ]
+        return min(due + [self._expires_at_s(key) for key in self._incoming], default=math.inf)
+
+    def _expires_at_s(self, key: _Key) -> float:
+        """Return when an unfinished blob is dropped if nothing comes of it until then."""
         keep_s = self._options.keep_partial_s
-        expiries = [incoming.heard_at_s + keep_s for incoming in self._incoming.values()]
-        return min(due + expiries, default=math.inf)
+        if self._is_superseded(key):
+            keep_s = min(keep_s, _SUPERSEDED_INTERVALS * self._options.pace.status_interval_s)
+        return self._incoming[key].heard_at_s + keep_s
+
+    def _is_superseded(self, key: _Key) -> bool:
+        """Whether the sender has begun another blob of which it has one at a time for us.
+
+        It may be that this one is the newer, of which a late chunk has come after the
+        other began: so neither is dropped while it is heard of.
+        """
+        descriptor = self._incoming[key].descriptor
+        kind = None if descriptor is None else _ONE_AT_A_TIME.get(descriptor.kind)
+        return kind is not None and self._newest.get((key[0], kind)) != key[1]
+
+    def _answer_budget(self, peer: int) -> ByteBudget:
+        """Return what may be spent on answers to a peer."""
+        if peer not in self._answer_budgets:
+            rate = _ANSWERS_SHARE * self._options.pace.rate_bytes_per_s
+            burst_bytes = _MAX_STATUSES * MAX_FRAME_BYTES
+            self._answer_budgets[peer] = ByteBudget(rate, burst_bytes)
+        return self._answer_budgets[peer]
+
+    def _is_begun(self, key: _Key) -> bool:
+        """Whether an unfinished blob is meant for us, and which chunks it has."""
+        incoming = self._incoming.get(key)
+        return incoming is not None and incoming.descriptor is not None
 
     def _open(self, key: _Key, now_s: float, events: list[ReceptionEvent]) -> Incoming | None:
         """Return the unfinished blob of a chunk, a new one if need be; None if too many are."""
@@ -180,20 +252,31 @@ class Receptions:
             if descriptor.length_bytes > self._options.max_blob_bytes:
                 events.append(self._refuse(key, Reply.TOO_LARGE, "longer than allowed", now_s))
                 return
+        is_sum = chunk.index >= FIRST_SUM
+        if is_sum and descriptor is None:
+            incoming.heard_at_s = now_s
+            return
         # Without a descriptor nobody knows which chunk is the last, the only one that is short.
-        full = CHUNK_DATA_BYTES if descriptor is None else descriptor.chunk_bytes(chunk.index)
+        full = CHUNK_DATA_BYTES
+        if descriptor is not None and not is_sum:
+            full = descriptor.chunk_bytes(chunk.index)
         if len(chunk.data) != full:
             return
         room = incoming.room_for(chunk.index + 1) if descriptor is None else descriptor.n_chunks
-        more_bytes = (room - len(incoming.arrived)) * CHUNK_COST_BYTES
+        more_bytes = (room - len(incoming.arrived)) * CHUNK_COST_BYTES + is_sum * SUM_COST_BYTES
         incoming.starved = not self._fits(key, more_bytes, now_s, events)
         if incoming.starved:
             return
         if descriptor is not None and incoming.end > descriptor.n_chunks:
             incoming.begin_again()
+        if descriptor is not None and incoming.descriptor is None:
+            self._newest[key[0], _ONE_AT_A_TIME.get(descriptor.kind, descriptor.kind)] = key[1]
         incoming.descriptor = descriptor
         incoming.make_room(room)
-        incoming.put(chunk)
+        if is_sum and descriptor is not None:
+            incoming.put_sum(chunk, descriptor.n_chunks)
+        else:
+            incoming.put(chunk)
         incoming.heard_at_s = now_s
         if descriptor is not None and incoming.n_arrived == descriptor.n_chunks:
             self._finish(key, incoming, descriptor, now_s, events)
@@ -244,7 +327,7 @@ class Receptions:
         if not keys:
             return False
         idlest = min(keys, key=lambda key: self._incoming[key].heard_at_s)
-        if now_s - self._incoming[idlest].heard_at_s < _IDLE_SHARE * self._options.give_up_s:
+        if now_s - self._incoming[idlest].heard_at_s < _IDLE_SHARE * self._options.pace.give_up_s:
             return False
         events.append(self._abandon(idlest, "idle, and its memory was needed"))
         return True
@@ -277,7 +360,7 @@ class Receptions:
         owed = self._answers.get(key)
         if owed is None and not chunk.ask:
             return
-        interval_s = self._options.status_interval_s
+        interval_s = self._options.pace.status_interval_s
         asked_at_s = now_s if owed is None else owed.asked_at_s
         due_s = min(asked_at_s + interval_s, now_s + _QUIET_SHARE * interval_s)
         incoming = self._incoming.get(key)
@@ -302,6 +385,8 @@ class Receptions:
         incoming = self._incoming.get(key)
         if incoming is None or incoming.starved:
             return [TransferStatus(tag, Reply.BUSY, ask)]
+        if incoming.is_for_several and incoming.descriptor is not None:
+            return list(lacking_statuses(tag, ask, incoming.lacking_counts()))
         statuses = receiving_statuses(tag, ask, incoming.known_end(), incoming.missing())
         return list(itertools.islice(statuses, _MAX_STATUSES))
 

@@ -10,9 +10,12 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
 
 from vcl_companion.errors import WireError
 from vcl_companion.wire.header import HEADER_BYTES, MAX_BLOB_BYTES, MAX_PAYLOAD_BYTES, BlobKind
@@ -27,12 +30,18 @@ _CHUNK = struct.Struct("<IHB")
 CHUNK_DATA_BYTES = MAX_PAYLOAD_BYTES - HEADER_BYTES - _CHUNK.size
 MAX_CHUNKS = 1 << 17
 MAX_ASK = 127
+# Sums are over so many chunks; larger ones lose less to chance, and take longer to solve.
+BLOCK_CHUNKS = 1024
+_MAX_BLOCKS = MAX_CHUNKS // BLOCK_CHUNKS
 
 # Descriptor, the first 37 bytes of every stream
 # | 0 | u8       | blob kind             |
 # | 1 | u32      | blob length, bytes    |
 # | 5 | 32 bytes | SHA-256 of the blob   |
 _DESCRIPTOR = struct.Struct("<BI32s")
+
+# Sums of chunks are numbered after the last chunk of the longest stream.
+FIRST_SUM = -(-(_DESCRIPTOR.size + MAX_BLOB_BYTES) // CHUNK_DATA_BYTES)
 
 # TransferStatus body
 # | 0  | u32     | tag                                                                   |
@@ -42,6 +51,9 @@ _DESCRIPTOR = struct.Struct("<BI32s")
 # | 6  | u32     | first                                                                 |
 # | 10 | u32     | end                                                                   |
 # | 14 | rest    | missing ranges: pairs of varints (chunks since the last range, length) |
+# reply LACKING: how many more are needed of the blocks from ``first`` on
+# | 6  | u8      | first                                                                 |
+# | 7  | rest    | a varint for each block, up to 1024                                   |
 # reply COMPLETE:
 # | 6  | 8 bytes | first of the SHA-256 of the blob                                      |
 _STATUS = struct.Struct("<IBB")
@@ -49,6 +61,7 @@ _WINDOW = struct.Struct("<2I")
 _DIGEST_BYTES = 8
 _MAX_RANGE_BYTES = MAX_PAYLOAD_BYTES - HEADER_BYTES - _STATUS.size - _WINDOW.size
 _MAX_VARINT_BYTES = 3
+_MAX_COUNT_BYTES = MAX_PAYLOAD_BYTES - HEADER_BYTES - _STATUS.size - 1
 
 
 class Reply(IntEnum):
@@ -59,6 +72,7 @@ class Reply(IntEnum):
     BUSY = 3
     TOO_LARGE = 4
     CORRUPT = 5
+    LACKING = 6
 
 
 @dataclass(frozen=True)
@@ -94,9 +108,11 @@ class TransferStatus:
         tag: which stream.
         reply: how the transfer stands.
         ask: the newest ask number heard.
-        first, end: RECEIVING: the chunks this status tells of; of others it says nothing.
+        first, end: RECEIVING: the chunks this status tells of; LACKING: the blocks; of others
+            it says nothing.
         missing: RECEIVING: half-open ranges among them that did not arrive, ascending and
             apart from each other; all others did.
+        counts: LACKING: how many more chunks or sums are needed of each of these blocks.
         digest: COMPLETE: first 8 bytes of the SHA-256 of the blob that arrived.
     """
 
@@ -106,6 +122,7 @@ class TransferStatus:
     first: int = 0
     end: int = 0
     missing: tuple[tuple[int, int], ...] = ()
+    counts: tuple[int, ...] = ()
     digest: bytes = b""
 
     def __post_init__(self) -> None:
@@ -113,6 +130,11 @@ class TransferStatus:
             raise ValueError(f"a status out of range: tag {self.tag}, ask {self.ask}")
         if len(self.digest) != (_DIGEST_BYTES if self.reply == Reply.COMPLETE else 0):
             raise ValueError(f"{self.reply.name} with a digest of {len(self.digest)} bytes")
+        if self.reply == Reply.LACKING:
+            self._check_counts()
+            return
+        if self.counts:
+            raise ValueError(f"{self.reply.name} with counts")
         if self.reply != Reply.RECEIVING and (self.first, self.end, self.missing) != (0, 0, ()):
             raise ValueError(f"{self.reply.name} with a window of chunks")
         if not 0 <= self.first <= self.end <= MAX_CHUNKS:
@@ -124,6 +146,16 @@ class TransferStatus:
             at = stop
         if len(_encode_ranges(self.first, self.missing)) > _MAX_RANGE_BYTES:
             raise ValueError(f"{len(self.missing)} missing ranges do not fit one status")
+
+    def _check_counts(self) -> None:
+        if not self.counts or self.missing or self.end != self.first + len(self.counts):
+            raise ValueError(f"{len(self.counts)} counts of blocks {self.first} to {self.end}")
+        if not 0 <= self.first < self.end <= _MAX_BLOCKS:
+            raise ValueError(f"blocks {self.first} to {self.end}")
+        if not all(0 <= count <= BLOCK_CHUNKS for count in self.counts):
+            raise ValueError("a block lacks more than it has")
+        if len(_encode_varints(self.counts)) > _MAX_COUNT_BYTES:
+            raise ValueError(f"{len(self.counts)} counts do not fit one status")
 
 
 @dataclass(frozen=True)
@@ -171,6 +203,11 @@ class Descriptor:
         if index == 0:
             return self.encode() + blob[: start + CHUNK_DATA_BYTES]
         return blob[start : start + CHUNK_DATA_BYTES]
+
+    def rows(self, blob: bytes) -> NDArray[np.uint8]:
+        """Return the data of all chunks, (n_chunks, 119), the last one filled with zeros."""
+        stream = (self.encode() + blob).ljust(self.n_chunks * CHUNK_DATA_BYTES, b"\0")
+        return np.frombuffer(stream, dtype=np.uint8).reshape(-1, CHUNK_DATA_BYTES)
 
     def blob_of(self, stream: bytearray) -> bytes | None:
         """Return the blob of a stream whose chunks all arrived; None when its hash is wrong."""
@@ -220,6 +257,8 @@ def encode_status(status: TransferStatus) -> bytes:
     if status.reply == Reply.RECEIVING:
         window = _WINDOW.pack(status.first, status.end)
         return head + window + _encode_ranges(status.first, status.missing)
+    if status.reply == Reply.LACKING:
+        return head + bytes([status.first]) + _encode_varints(status.counts)
     return head + status.digest
 
 
@@ -231,14 +270,19 @@ def decode_status(body: bytes) -> TransferStatus:
         raise WireError(f"unknown transfer reply {reply}")
     first, end, digest = 0, 0, b""
     missing: tuple[tuple[int, int], ...] = ()
+    counts: tuple[int, ...] = ()
     if reply == Reply.RECEIVING:
         first, end = reader.unpack(_WINDOW)
         missing = _decode_ranges(first, body[_STATUS.size + _WINDOW.size :])
+    elif reply == Reply.LACKING:
+        (first,) = reader.take(1)
+        counts = tuple(_decode_varints(body[_STATUS.size + 1 :]))
+        end = first + len(counts)
     else:
         digest = reader.take(_DIGEST_BYTES if reply == Reply.COMPLETE else 0)
         reader.finish()
     try:
-        return TransferStatus(tag, Reply(reply), ask, first, end, missing, digest)
+        return TransferStatus(tag, Reply(reply), ask, first, end, missing, counts, digest)
     except ValueError as error:
         raise WireError(str(error)) from None
 
@@ -268,35 +312,58 @@ def receiving_statuses(
     yield TransferStatus(tag, Reply.RECEIVING, ask, first, end, tuple(fitting))
 
 
+def lacking_statuses(tag: int, ask: int, counts: list[int]) -> Iterator[TransferStatus]:
+    """Yield the statuses that tell how many more are needed of every block."""
+    most = _MAX_COUNT_BYTES // 2  # a count of up to 1024 takes two bytes
+    for first in range(0, len(counts), most):
+        told = tuple(counts[first : first + most])
+        end = first + len(told)
+        yield TransferStatus(tag, Reply.LACKING, ask, first, end, counts=told)
+
+
 def _encode_ranges(first: int, missing: tuple[tuple[int, int], ...]) -> bytes:
     """Return the varint pairs of the missing ranges of a window that starts at ``first``."""
-    out, at = bytearray(), first
+    values, at = [], first
     for start, stop in missing:
-        for value in (start - at, stop - start):
-            while value > 0x7F:
-                out.append(0x80 | value & 0x7F)
-                value >>= 7
-            out.append(value)
+        values += [start - at, stop - start]
         at = stop
+    return _encode_varints(values)
+
+
+def _encode_varints(values: Sequence[int]) -> bytes:
+    out = bytearray()
+    for value in values:
+        rest = value
+        while rest > 0x7F:
+            out.append(0x80 | rest & 0x7F)
+            rest >>= 7
+        out.append(rest)
     return bytes(out)
 
 
 def _decode_ranges(first: int, data: bytes) -> tuple[tuple[int, int], ...]:
     """Return the missing ranges of varint pairs; their order is checked by ``TransferStatus``."""
-    values: list[int] = []
-    value = n_bytes = 0
-    for byte in data:
-        value |= (byte & 0x7F) << 7 * n_bytes
-        n_bytes += 1
-        if n_bytes > _MAX_VARINT_BYTES or (byte == 0 and n_bytes > 1):
-            raise WireError("missing ranges: a number is not in its shortest form")
-        if byte < 0x80:
-            values.append(value)
-            value = n_bytes = 0
-    if n_bytes or len(values) % 2:
+    values = _decode_varints(data)
+    if len(values) % 2:
         raise WireError("missing ranges end early")
     missing, at = [], first
     for gap, length in zip(values[::2], values[1::2], strict=True):
         missing.append((at + gap, at + gap + length))
         at += gap + length
     return tuple(missing)
+
+
+def _decode_varints(data: bytes) -> list[int]:
+    values: list[int] = []
+    value = n_bytes = 0
+    for byte in data:
+        value |= (byte & 0x7F) << 7 * n_bytes
+        n_bytes += 1
+        if n_bytes > _MAX_VARINT_BYTES or (byte == 0 and n_bytes > 1):
+            raise WireError("transfer status: a number is not in its shortest form")
+        if byte < 0x80:
+            values.append(value)
+            value = n_bytes = 0
+    if n_bytes:
+        raise WireError("transfer status ends within a number")
+    return values
