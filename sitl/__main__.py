@@ -78,7 +78,10 @@ def main() -> None:
     help="Send the attitude streams of an earlier flight again: its --out.",
 )
 @click.option(
-    "--seed", default=0, show_default=True, help="Of the noise of the attitude made from the truth."
+    "--seed",
+    default=0,
+    show_default=True,
+    help="Of the noise of the attitude made from the truth, and of the network.",
 )
 @click.option(
     "--start-timeout",
@@ -99,6 +102,31 @@ def main() -> None:
     type=click.Choice(_PIPELINES),
     help="How daemons find their poses; the same as --set pipeline=...; default if not given.",
 )
+@click.option("--loss", default=0.0, metavar="P", help="Share of the peers' datagrams lost.")
+@click.option(
+    "--burst", type=float, metavar="N", help="Mean number of datagrams lost in a row, with --loss."
+)
+@click.option("--delay", default=0.0, metavar="S", help="Seconds that each is on its way.")
+@click.option("--jitter", default=0.0, metavar="S", help="Up to so many seconds more.")
+@click.option("--reorder", default=0.0, metavar="P", help="Share held back for 50 ms.")
+@click.option("--duplicate", default=0.0, metavar="P", help="Share that arrives twice.")
+@click.option("--corrupt", default=0.0, metavar="P", help="Share that arrives with wrong bytes.")
+@click.option("--rate", type=float, metavar="BIT/S", help="Of each drone's transmitter.")
+@click.option("--shared", is_flag=True, help="All drones together have that --rate.")
+@click.option(
+    "--queue",
+    default=0.5,
+    show_default=True,
+    metavar="S",
+    help="A datagram that would wait for longer for its transmission is dropped, with --rate.",
+)
+@click.option(
+    "--partition",
+    "partitions",
+    multiple=True,
+    metavar="10-40:mav0|mav1,mav2",
+    help="Groups that do not hear each other, between two seconds of the recording (repeatable).",
+)
 def fly(
     recording: Path,
     out: Path,
@@ -110,16 +138,31 @@ def fly(
     start_timeout: float,
     settings: tuple[str, ...],
     pipeline: str | None,
+    loss: float,
+    burst: float | None,
+    delay: float,
+    jitter: float,
+    reorder: float,
+    duplicate: float,
+    corrupt: float,
+    rate: float | None,
+    shared: bool,
+    queue: float,
+    partitions: tuple[str, ...],
 ) -> None:
     """Fly RECORDING (a folder; the embedded demo by default) and report how it went.
 
     One real daemon and one stand-in autopilot per drone, over real sockets.
+    What the drones say to each other may go over a bad radio: --loss to --partition,
+    in seconds of the wall clock whatever the --speed, but for --partition.
     Leaves estimates, truth, report.json and report.html in the output folder.
     Exit status: 0, 2 for input that cannot be used, 1 when a process ended.
     """
     from rich.console import Console
 
     from sitl.fly import fly as fly_recording
+    from sitl.network import NetworkOptions
+    from sitl.partitions import parse_partition
     from sitl.plan import FlyOptions, parse_known_distance, parse_setting, pipeline_setting
     from sitl.terminal import progress_shown, show_report
 
@@ -134,6 +177,19 @@ def fly(
             *([pipeline_setting(pipeline)] if pipeline else []),
         ),
         seed=seed,
+        network=NetworkOptions(
+            loss=loss,
+            burst=burst,
+            delay_s=delay,
+            jitter_s=jitter,
+            reorder=reorder,
+            duplicate=duplicate,
+            corrupt=corrupt,
+            rate_bits_per_s=rate,
+            shared=shared,
+            queue_s=queue,
+            partitions=tuple(map(parse_partition, partitions)),
+        ),
     )
     embedded = str(recording) == "demo" and not recording.exists()
     console = Console()

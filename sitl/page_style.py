@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from html import escape
 
 CSS = """
 :root { color-scheme: light; }
@@ -34,7 +35,7 @@ td.text, th.text { text-align: left; white-space: normal; }
 tr:last-child td { border-bottom: 0; }
 .swatch { display: inline-block; width: 11px; height: 11px; border-radius: 3px;
   margin-right: 8px; }
-.scroll { overflow-x: auto; }
+.scroll { overflow-x: auto; } .scroll + .scroll { margin-top: 26px; }
 svg[role=img] { width: 100%; height: auto; display: block; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: 4px 20px; margin: 0;
   font-size: 14.5px; }
@@ -58,3 +59,11 @@ def section(title: str, note: str, content: str) -> str:
     """Return a titled part of a page; note and content are HTML."""
     noted = f"<p class=note>{note}</p>" if note else ""
     return f"<section>\n<h2>{title}</h2>{noted}{content}\n</section>"
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table of plain texts, as wide as it needs to be."""
+    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
+    lines = ("".join(f"<td>{escape(text)}</td>" for text in row) for row in rows)
+    body = "".join(f"<tr>{line}</tr>" for line in lines)
+    return f"<div class=scroll><table><tr>{head}</tr>{body}</table></div>"

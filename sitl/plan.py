@@ -6,12 +6,14 @@ import math
 import re
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sitl.network import NetworkOptions
+from sitl.partitions import check_flying
 from vcl_companion.config import Config
 from vcl_companion.errors import ConfigError
 from vcl_companion.recording import Drone, KnownPair, Recording
@@ -44,7 +46,8 @@ class FlyOptions:
         drones: names of those that fly; empty: all.
         start_timeout_s: how long the daemons have to come up, and again to make the first map.
         settings: more of the daemons' configuration.
-        seed: of the noise of the attitude.
+        seed: of the noise of the attitude, and of the network.
+        network: how bad the radio between the drones is.
     """
 
     speed: float = 1.0
@@ -54,6 +57,7 @@ class FlyOptions:
     start_timeout_s: float = 30.0
     settings: tuple[Setting, ...] = ()
     seed: int = 0
+    network: NetworkOptions = field(default_factory=NetworkOptions)
 
     def __post_init__(self) -> None:
         if not self.speed > 0.0:
@@ -184,6 +188,7 @@ def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:
         for n, drone in enumerate(recording.drones)
         if drone.name in flying
     )
+    check_flying(options.network.partitions, flying)
     return FlightPlan(
         recording=recording,
         drones=drones,

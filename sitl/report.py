@@ -18,6 +18,7 @@ Terms beyond ``sitl.evaluation``'s:
   ``features``, on a ``peer`` alone, on attitude and ``motion`` alone, or where ``nothing``
   was sent.
 * ``peer_bytes_per_s``: sent to the other drones, per second of recording time.
+* ``peer_link``: the same by message, and what became of it (``sitl.network_report``).
 * ``map``: the leader's last revision; ``revisions`` counts all of them.
 """
 
@@ -31,6 +32,7 @@ from typing import Any
 
 import numpy as np
 
+from sitl.network_report import options_of, peer_link_of
 from sitl.plan import pipeline_of
 from sitl.reliance import shares
 from sitl.report_page import page
@@ -82,10 +84,17 @@ def report_of(result: FlightResult) -> dict[str, Any]:
             },
             "attitude": "replayed" if options.attitude else "from truth with noise",
             "seed": options.seed,
+            "network": options_of(options.network),
             "start_timeout_s": options.start_timeout_s,
             "settings": {".".join(setting.path): setting.value for setting in options.settings},
         },
-        "drones": {drone.name: _drone(drone, duration_s) for drone in result.drones},
+        "drones": {
+            drone.name: {
+                **_drone(drone, duration_s),
+                "peer_link": peer_link_of(result.network, drone.name, duration_s),
+            }
+            for drone in result.drones
+        },
         "map": {
             "revisions": len({row.revision for row in result.maps}),
             "landmarks": last_map.landmarks if last_map else 0,

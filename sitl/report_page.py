@@ -7,6 +7,7 @@ from html import escape
 from typing import Any
 
 from sitl import report_plots
+from sitl.network_report import network_html, network_text
 from sitl.page_style import document, section
 from sitl.plotting import colour
 from sitl.reliance import RELIANCES, strips_svg
@@ -40,6 +41,7 @@ def page(result: FlightResult, report: Mapping[str, Any]) -> str:
     """Return the whole page of a flight; ``report`` is what ``report.json`` says."""
     name = escape(str(report["recording"]))
     errors = report_plots.errors_svg(result)
+    network = network_html(report)
     parts = [
         _alarms(report),
         section("Where they flew", _flight_note(result), report_plots.trajectories_svg(result)),
@@ -51,6 +53,7 @@ def page(result: FlightResult, report: Mapping[str, Any]) -> str:
         section("Tracked landmarks", "", report_plots.landmarks_svg(result)),
         section("Latency and load", _LATENCY_NOTE,
                  report_plots.latency_svg(result) + _load_table(report)),
+        section("Between the drones", _NETWORK_NOTE, network) if network else "",
         _refusals(report),
         _events(report),
         section("How it was flown", "", _options(report)),
@@ -82,6 +85,13 @@ _ERROR_NOTE = (
 _LATENCY_NOTE = (
     "From a frame's arrival in the daemon to its outcome, of the frames that were looked at. The "
     "first frame waits for the first map and is told apart."
+)
+
+_NETWORK_NOTE = (
+    "What each drone sent to the others, once for each of them: the payload of TUNNEL, the whole "
+    "MAVLink frames, and the frames by drone in kB, from the start of the daemons to their end; "
+    "B/s per second of the recording. Below what became of the datagrams, by sender, and the "
+    "delay that the network gave them."
 )
 
 
@@ -241,6 +251,7 @@ def _options(report: Mapping[str, Any]) -> str:
         ("leader", options["leader"]),
         ("known distance", distances or "none"),
         ("attitude", f"{options['attitude']}, seed {options['seed']}"),
+        ("network", network_text(options["network"])),
         ("pipeline", report["pipeline"]),
         ("settings", settings or "defaults"),
         ("map revisions", f"{swarm_map['revisions']} ({swarm_map['keyframes']} keyframes)"),

@@ -24,6 +24,7 @@ from sitl.flight_log import (
     read_flight_log,
     read_received,
 )
+from sitl.network_log import NetworkLog, read_network_log
 from sitl.plan import FlightPlan, PlannedDrone
 from sitl.processes import FlightError
 from vcl_companion.errors import WireError
@@ -118,6 +119,7 @@ class FlightResult:
         points_ref_m: (N, 3) landmarks of the last map, where ``ref_from_world``
             puts them, else in ``world``.
         events: of all drones and the harness, in time order.
+        network: what went between the drones; None when it was not counted.
     """
 
     plan: FlightPlan
@@ -126,6 +128,7 @@ class FlightResult:
     maps: tuple[MapRow, ...]
     points_ref_m: Array
     events: tuple[Event, ...]
+    network: NetworkLog | None = None
 
 
 def gather(plan: FlightPlan, out: Path, events: Iterable[Event] = ()) -> FlightResult:
@@ -145,6 +148,7 @@ def gather(plan: FlightPlan, out: Path, events: Iterable[Event] = ()) -> FlightR
         d.name: _on_frames(d, read_received(out / d.name / "received.jsonl", d.system_id))
         for d in plan.drones
     }
+    network = read_network_log(out)
     alignment = _alignment(*heard[plan.leader], truths[plan.leader])
     drones = tuple(
         _drone_result(d, truths[d.name], *heard[d.name], logs[d.name], alignment)
@@ -153,6 +157,8 @@ def gather(plan: FlightPlan, out: Path, events: Iterable[Event] = ()) -> FlightR
     maps = logs[plan.leader].maps or next((log.maps for log in logs.values() if log.maps), ())
     points = _map_points(out / "run" / plan.leader / "maps", maps)
     said = [*events, *_logged(plan, logs), *(e for d in drones for e in _doubts(d))]
+    if network is not None:
+        said += _network_doubts(network)
     if alignment is None and any(d.truth and any(d.truth) for d in drones):
         why = f"{plan.leader} has no estimate with a truth: nothing is compared with the truth"
         said.append(Event(0.0, plan.leader, "harness", why))
@@ -163,6 +169,7 @@ def gather(plan: FlightPlan, out: Path, events: Iterable[Event] = ()) -> FlightR
         maps=maps,
         points_ref_m=points if alignment is None else alignment.apply(points),
         events=tuple(sorted(said, key=lambda event: event.at_s)),
+        network=network,
     )
 
 
@@ -277,3 +284,13 @@ def _doubts(drone: DroneResult) -> list[Event]:
     if coasted != drone.n_coasted:
         out.append(f"{coasted} frames by motion by the log, {drone.n_coasted} poses received")
     return [Event(0.0, drone.name, "harness", text) for text in out]
+
+
+def _network_doubts(network: NetworkLog) -> list[Event]:
+    """Return what happened to datagrams that no option asked for."""
+    out = []
+    if network.n_dropped:
+        out.append(f"{network.n_dropped} datagrams were lost by the harness, not by the network")
+    if network.n_strangers:
+        out.append(f"{network.n_strangers} datagrams came from no daemon of this flight")
+    return [Event(0.0, "network", "harness", text) for text in out]

@@ -1,4 +1,7 @@
-"""A flying swarm: per drone one real daemon, one stand-in autopilot, one camera server."""
+"""A flying swarm: per drone one real daemon, one stand-in autopilot, one camera server.
+
+Between the daemons lies a relay, which is the radio.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,11 @@ from pathlib import Path
 import sitl
 from sitl.daemon_config import daemon_config, key_path, toml_text
 from sitl.frame_server import FrameServer
+from sitl.network import Network
+from sitl.network_log import write_network_log
 from sitl.plan import FlightPlan, PlannedDrone
 from sitl.processes import Child, FlightError, end_children, start_child, unless_one_ends
+from sitl.relay import Relay
 from sitl.stand_in_process import StandIn, start_stand_in
 from vcl_companion.links.key_file import make_key_file
 
@@ -61,6 +67,7 @@ class Swarm:
         self._out = out.resolve()
         self._cameras: list[FrameServer] = []
         self._stand_ins: list[Child] = []
+        self._relay: Relay | None = None
 
     @property
     def children(self) -> list[Child]:
@@ -82,11 +89,15 @@ class Swarm:
             self._stand_ins.append(child)
             self.drones.append(FlyingDrone(planned, camera, await StandIn.of(child)))
         camera_ports = [await camera.start() for camera in self._cameras]
+        # Its own ports first: they are held, so none of the daemons' can be the same.
+        self._relay = self._open_relay()
         peer_ports = free_udp_ports(len(self.drones))
+        names = [drone.planned.name for drone in self.drones]
+        self._relay.start(dict(zip(names, peer_ports, strict=True)))
         for n, drone in enumerate(self.drones):
             config = daemon_config(
                 self._plan, drone.planned, self._out, camera_ports[n], drone.stand_in.port,
-                peer_ports[n], peer_ports[:n] + peer_ports[n + 1 :],
+                peer_ports[n], self._relay.ports(drone.planned.name),
             )  # fmt: skip
             path = self._run_folder(drone.planned) / "daemon.toml"
             path.write_text(toml_text(config), encoding="utf-8")
@@ -102,7 +113,9 @@ class Swarm:
         await unless_one_ends(self.children, self._all_connected())
 
     async def advance_to(self, at_ns: int) -> None:
-        """Move every autopilot's time on."""
+        """Move every autopilot's time on, and the network's."""
+        if self._relay is not None:
+            self._relay.flight_s = (at_ns - self._plan.starts_at_ns) * 1e-9
         await asyncio.gather(*(drone.stand_in.advance_to(at_ns) for drone in self.drones))
 
     async def clocks_related(self, at_ns: int) -> None:
@@ -134,12 +147,24 @@ class Swarm:
                 raise FlightError(child.obituary())
         for drone in self.drones:
             await drone.stand_in.finish()
+        if self._relay is not None:
+            write_network_log(self._out, self._relay)
 
     async def end(self) -> None:
         """End whatever of ours still runs."""
         await end_children(self.children, _END_TIMEOUT_S)
         for camera in self._cameras:
             await camera.close()
+        if self._relay is not None:
+            self._relay.close()
+
+    def _open_relay(self) -> Relay:
+        options = self._plan.options
+        network = Network(options.network, options.seed)
+        try:
+            return Relay([drone.planned.name for drone in self.drones], network)
+        except OSError as error:
+            raise FlightError(f"no sockets between the drones: {error.strerror}") from error
 
     async def _all_connected(self) -> None:
         timeout_s = self._plan.options.start_timeout_s

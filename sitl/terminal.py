@@ -16,6 +16,7 @@ from rich.table import Table
 
 from sitl.fly import Progress
 from sitl.goals import Goal
+from sitl.network_report import DELAYS, NETWORK_COLUMNS, delay_text, message_rows
 
 
 @contextmanager
@@ -57,13 +58,10 @@ def _line_per_stage(console: Console) -> Progress:
 
 def show_report(console: Console, report: Mapping[str, Any], out: Path) -> None:
     """Print a flight's table, what needs attention, and where the report is."""
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
-    table.add_column("drone", no_wrap=True)
-    for title in (
-        "frames", "localized\n%", "refused", "dropped", "ATE\nm", "aligned\nm",
+    table = _numbers((
+        "drone", "frames", "localized\n%", "refused", "dropped", "ATE\nm", "aligned\nm",
         "yaw\ndeg", "p50\nms", "p99\nms", "CPU\n%", "RSS\nMB",
-    ):  # fmt: skip
-        table.add_column(title, justify="right", no_wrap=True)
+    ))  # fmt: skip
     for name, drone in report["drones"].items():
         table.add_row(
             name,
@@ -80,11 +78,49 @@ def show_report(console: Console, report: Mapping[str, Any], out: Path) -> None:
             _number(drone["resident_mb"], 0),
         )
     console.print(table)
+    _show_network(console, report)
     for event in report["events"]:
         if event["kind"] == "harness":
             text = f"ATTENTION {event['drone']}: {event['reason']}"
             console.print(text, style="bold red", markup=False, highlight=False)
     console.print(f"report: {out / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _show_network(console: Console, report: Mapping[str, Any]) -> None:
+    """Print what the drones sent each other, and what became of it, if it was counted."""
+    rows = message_rows(report)
+    if not rows:
+        return
+    drones = report["drones"]
+    heads = ("to peers", "messages", "payload\nkB", "wire\nkB", "%", "B/s")
+    table = _numbers((*heads, *(f"{name}\nkB" for name in drones)))
+    for row in rows:
+        table.add_row(
+            row.name,
+            str(row.messages),
+            _number(row.payload_bytes / 1e3, 1),
+            _number(row.wire_bytes / 1e3, 1),
+            _number(100.0 * row.share, 1),
+            _number(row.wire_bytes_per_s, 0),
+            *(_number(n / 1e3, 1) for n in row.by_drone),
+        )
+    console.print(table)
+    labels = (label.replace(" ", "\n") for _, label in NETWORK_COLUMNS)
+    table = _numbers(("network", *labels, "delay\nms", "longest\nms"))
+    for name, drone in drones.items():
+        said = drone["peer_link"]["network"]
+        counts = (str(said[key]) for key, _ in NETWORK_COLUMNS)
+        table.add_row(name, *counts, *(delay_text(said[key]) for key in DELAYS))
+    console.print(table)
+
+
+def _numbers(heads: Sequence[str]) -> Table:
+    """Return a table whose first column names what the numbers in the others are of."""
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+    table.add_column(heads[0], no_wrap=True)
+    for head in heads[1:]:
+        table.add_column(head, justify="right", no_wrap=True)
+    return table
 
 
 def show_goals(console: Console, goals: Mapping[str, Sequence[Goal]], out: Path) -> None:

@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from sitl.evaluation import upper_from_covariance
+from sitl.network_log import NetworkLog
 from sitl.out_folder import prepare_folder
 from sitl.plan import FlightPlan, FlyOptions, plan_flight
 from vcl_companion.geometry.camera import Camera
@@ -61,6 +63,7 @@ class Flight:
             without a fix of its own such a frame has only that.
         starved: (drone, frame) without a fix of its own.
         coasted: (drone, frame) refused, and sent by attitude and motion alone.
+        network: what the relay between the drones counted, if it did.
         features: (drone, frame) whose own fix rests on features, not on patches.
         error: (drone, frame) to the (6,) error of its pose, as MAVLink puts it.
     """
@@ -76,6 +79,7 @@ class Flight:
     starved: frozenset[tuple[str, int]] = frozenset()
     coasted: frozenset[tuple[str, int]] = frozenset()
     features: frozenset[tuple[str, int]] = frozenset()
+    network: NetworkLog | None = None
     error: ErrorOf = field(default=lambda _drone, _frame: np.zeros(6))
 
 
@@ -123,6 +127,8 @@ def leave_behind(tmp_path: Path, flight: Flight) -> tuple[FlightPlan, Path]:
         (run / "maps" / f"{revision}.vclmap").write_bytes(encoded)
         _write_lines(run / "flight.jsonl", _log(planned.name, n, flight, revision, len(encoded)))
         _write_lines(out / planned.name / "received.jsonl", _received(planned.name, n, flight))
+    if flight.network is not None:
+        (out / "run" / "network.json").write_bytes(msgspec.json.encode(flight.network))
     return plan, out
 
 

@@ -129,6 +129,49 @@ def test_the_drones_of_a_flight_sign_what_they_say_to_each_other(flown: Path) ->
     assert not any(secret in path.read_bytes() for path in told)
 
 
+def test_what_the_drones_say_to_each_other_is_counted_by_message(flown: Path) -> None:
+    for drone in report_in(flown)["drones"].values():
+        link = drone["peer_link"]
+        said = link["by_message"]
+        assert {"heartbeat", "map state", "transfer status"} <= set(said)
+        assert said["heartbeat"]["payload_bytes"] == 0
+        assert sum(one["wire_bytes"] for one in said.values()) == link["wire_bytes"]
+        assert 0 < link["payload_bytes"] < link["wire_bytes"]
+        # The daemon's own count ends a moment before it falls silent.
+        assert link["wire_bytes"] == pytest.approx(drone["peer_bytes_sent"], rel=0.02)
+        network = link["network"]
+        assert network["offered"] == network["delivered"] == link["messages"]
+        assert network["delay_max_ms"] == 0.0
+    chunks = {
+        name for d in report_in(flown)["drones"].values() for name in d["peer_link"]["by_message"]
+    }
+    assert {"chunk: map", "chunk: frame answer"} <= chunks
+
+
+def test_a_swarm_flies_over_a_bad_network_and_the_report_says_how_bad(
+    recording: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    done = sitl_fly(
+        recording, "--out", out, "--speed", "max", "--loss", "0.2", "--burst", "3", "--delay",
+        "0.02", "--jitter", "0.01", "--duplicate", "0.1", "--corrupt", "0.05",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    report = report_in(out)
+    assert report["options"]["network"]["loss"] == 0.2
+    for name, drone in report["drones"].items():
+        assert drone["localized_share"] == 1.0, name
+        network = drone["peer_link"]["network"]
+        assert network["offered"] == (
+            network["lost"] + network["delivered"] - network["duplicated"]
+        )
+        assert min(network[key] for key in ("lost", "duplicated", "corrupted")) > 0
+        assert 20.0 <= network["delay_mean_ms"] <= network["delay_max_ms"] <= 30.001
+    assert "chunk: map" in done.stdout
+    assert "Between the drones" in (out / "report.html").read_text()
+    assert [event for event in report["events"] if event["kind"] == "harness"] == []
+
+
 def test_nothing_of_the_truth_reaches_a_daemon(
     flown: Path, recording: Path, tmp_path: Path
 ) -> None:
@@ -235,6 +278,11 @@ def test_input_that_cannot_be_used_is_one_line_and_status_2(
         ((recording, "--drones", "mav9"), "no 'mav9'"),
         ((recording, "--set", "log.level=debug"), "a string needs quotes"),
         ((recording, "--attitude", tmp_path), "no mav0/attitude.csv"),
+        ((recording, "--loss", "1.5"), "--loss must be a share of 0 to 1, got 1.5"),
+        ((recording, "--burst", "5"), "--burst needs a --loss"),
+        ((recording, "--rate", "-57600"), "--rate must be positive bits per second"),
+        ((recording, "--partition", "10-40"), "like 10-40:mav0|mav1,mav2"),
+        ((recording, "--partition", "1-2:mav0|mav7"), "'mav7' does not fly (mav0, mav1, mav2)"),
     ):
         done = CliRunner().invoke(main, ["fly", *map(str, arguments), "--out", str(out)])
         assert done.exit_code == 2, arguments

@@ -1,3 +1,4 @@
+import io
 import json
 import re
 from html.parser import HTMLParser
@@ -6,11 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from sitl.network import Fate
+from sitl.network_log import NetworkLog
+from sitl.network_report import message_rows
+from sitl.peer_traffic import Traffic
 from sitl.processes import FlightError
 from sitl.reliance import RELIANCES
 from sitl.report import report_of, write_report
 from sitl.result import FlightResult, gather
+from sitl.terminal import show_report
 from sitl.trajectory_files import write_trajectories
 from tests.sitl.flights import (
     NED_FROM_WORLD,
@@ -93,6 +100,62 @@ def test_numbers_are_those_of_the_logs(tmp_path: Path) -> None:
     assert drone["landmarks"] == 96.0
     size = len(next((out / "run" / "mav0" / "maps").iterdir()).read_bytes())
     assert report["map"] == {"revisions": 1, "landmarks": 200, "bytes": size, "keyframes": 1}
+
+
+def test_the_report_says_what_was_sent_and_what_became_of_it(tmp_path: Path) -> None:
+    state = {"map state": Traffic(10, 190, 420)}
+    log = NetworkLog(
+        sent={"mav0": {**state, "chunk: map": Traffic(100, 12_800, 14_500)}, "mav1": state},
+        fates={
+            "mav0": {
+                "mav1": Fate(offered=110, cut=5, queue_full=20, lost=15, duplicated=10,
+                             delivered=80, delay_sum_s=8.0, delay_max_s=0.25),
+            },
+        },
+        n_dropped=3,
+        n_strangers=0,
+    )  # fmt: skip
+    result, report, out = reported(tmp_path, Flight(network=log))
+    link = report["drones"]["mav0"]["peer_link"]
+    assert list(link["by_message"]) == ["chunk: map", "map state"]
+    assert (link["messages"], link["payload_bytes"], link["wire_bytes"]) == (110, 12_990, 14_920)
+    assert link["wire_bytes_per_s"] == pytest.approx(14_920 / report["duration_s"], rel=1e-6)
+    assert link["network"] == {
+        "offered": 110, "delivered": 80, "lost": 15, "queue_full": 20, "cut": 5, "corrupted": 0,
+        "duplicated": 10, "held_back": 0, "delay_mean_ms": 100.0, "delay_max_ms": 250.0,
+    }  # fmt: skip
+    silent = report["drones"]["mav1"]["peer_link"]["network"]
+    assert (silent["offered"], silent["delay_mean_ms"]) == (0, None)
+    assert [e["reason"] for e in report["events"] if e["kind"] == "harness"] == [
+        "3 datagrams were lost by the harness, not by the network"
+    ]
+    rows = message_rows(report)
+    assert [row.name for row in rows] == ["chunk: map", "map state", "all"]
+    assert rows[1].by_drone == (420, 420)
+    assert rows[2].share == 1.0
+    assert rows[2].wire_bytes == 14_920 + 420
+    page = page_of(result, out)
+    assert "<td>chunk: map</td><td>100</td><td>12.8</td><td>14.5</td><td>94.5</td>" in page
+    assert "<td>mav0</td><td>110</td><td>80</td><td>15</td><td>20</td><td>5</td>" in page
+    printed = io.StringIO()
+    show_report(Console(file=printed, width=120), report, out)
+    said = printed.getvalue()
+    assert re.search(r"chunk: map +100 +12\.8 +14\.5 +94\.5 +\d+ +14\.5 +0\.0", said)
+    assert re.search(r"mav0 +110 +80 +15 +20 +5 +0 +10 +0 +100\.0 +250\.0", said)
+
+
+def test_a_flight_that_was_not_counted_is_reported_without_the_table(tmp_path: Path) -> None:
+    result, report, out = reported(tmp_path, Flight())
+    assert report["drones"]["mav0"]["peer_link"] is None
+    assert message_rows(report) == []
+    assert "Between the drones" not in page_of(result, out)
+
+
+def test_a_network_log_that_is_broken_is_named(tmp_path: Path) -> None:
+    plan, out = leave_behind(tmp_path, Flight())
+    (out / "run" / "network.json").write_text('{"sent": 1}')
+    with pytest.raises(FlightError, match=r"network\.json"):
+        gather(plan, out)
 
 
 def test_the_report_tells_whence_the_poses_came_and_how_good_each_source_was(
