@@ -117,7 +117,8 @@ def test_two_processes_do_the_same_as_one(tmp_path: Path) -> None:
         for n in (1, 2)
     )
     assert one["outcomes"] == two["outcomes"]
-    assert two["processes"] == 2
+    assert one["processes"] == 1
+    assert two["payloads"] == 1_500
 
 
 def test_the_command_says_how_it_went(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
