@@ -360,6 +360,53 @@ def bench(
     run_bench(out, BenchOptions(what, only, seeds, quick), Console())
 
 
+@main.command()
+@click.option(
+    "--payloads", default=600_000, show_default=True, type=click.IntRange(min=1), metavar="N"
+)
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
+@click.option(
+    "--processes",
+    type=click.IntRange(min=1),
+    help="That share the work; otherwise one per core.",
+)
+@click.option(
+    "--session",
+    default=20_000,
+    show_default=True,
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Payloads that one drone lives through before another begins; they are numbered by it.",
+)
+@click.option(
+    "--only",
+    type=click.IntRange(min=0),
+    metavar="INDEX",
+    help="Go through this payload's session up to it, and tell whether it fails.",
+)
+@click.option("--out", default=Path("out/torture"), show_default=True, metavar="DIR", type=_FOLDER)
+def torture(
+    payloads: int, seed: int, processes: int | None, session: int, only: int | None, out: Path
+) -> None:
+    """Feed mutated payloads of hostile peers to all that a peer's bytes pass in a daemon.
+
+    From MAVLink frames to maps in use and poses fused, with the daemon's own parts. Nothing
+    but a WireError may be raised, and memory may not grow. Exit status: 0, 1 when
+    something failed, 2 for input that cannot be used.
+    """
+    # One thread for everybody: this counts before numpy is loaded.
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    from rich.console import Console
+
+    from sitl.torture.command import run_torture
+    from sitl.torture.report import TortureOptions
+
+    options = TortureOptions(payloads, seed, processes or 0, session)
+    if not run_torture(out, options, only, Console()):
+        click.get_current_context().exit(1)
+
+
 @main.group(name="import")
 def import_() -> None:
     """Turn recordings of other makers into ours."""

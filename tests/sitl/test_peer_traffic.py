@@ -58,7 +58,7 @@ def chunks(kind: BlobKind) -> list[Chunk]:
 def test_every_message_has_its_name() -> None:
     assert names(
         frame(MapState(b"", 0, False)),
-        frame(FrameRequest(7, 0.5)),
+        frame(FrameRequest(7, 1_000, 0.5)),
         frame(PoseRefused(7, "no overlap")),
         frame(TransferStatus(9, Reply.BUSY, 1)),
         codec().heartbeat(4),

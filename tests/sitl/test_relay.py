@@ -14,8 +14,9 @@ from sitl.network_log import read_network_log, write_network_log
 from sitl.partitions import parse_partition
 from sitl.relay import Relay
 from tests.ports import free_ports
+from vcl_companion.clock import ManualClock
 from vcl_companion.links.mavlink import Tunnel
-from vcl_companion.links.peers import PeerLink, PeerOptions
+from vcl_companion.links.peers import PeerLink, PeerOptions, open_signing
 from vcl_companion.wire.messages import MapState
 from vcl_companion.wire.tunnel import encode_payload
 
@@ -175,19 +176,22 @@ def test_peer_links_find_each_other_through_it_and_are_counted(tmp_path: Path) -
         ports = free_ports(2)
         heard: list[list[Tunnel]] = [[], []]
         alive: list[set[int]] = [set(), set()]
-        links = [
-            PeerLink(
-                PeerOptions(
-                    f"127.0.0.1:{ports[n]}",
-                    tuple(f"127.0.0.1:{port}" for port in relay.ports(NAMES[n])),
-                ),
-                n + 1,
-                frozenset({1, 2}),
-                heard[n].append,
-                alive[n].add,
+        options = [
+            PeerOptions(
+                f"127.0.0.1:{ports[n]}",
+                tuple(f"127.0.0.1:{port}" for port in relay.ports(NAMES[n])),
+                timestamp_file="",
+                allow_unsigned=True,
             )
             for n in range(2)
         ]
+        links = [
+            PeerLink(
+                options[n], n + 1, frozenset({1, 2}), heard[n].append, alive[n].add,
+                ManualClock(), lambda *_: None, open_signing(options[n]),
+            )
+            for n in range(2)
+        ]  # fmt: skip
         tasks = [asyncio.create_task(link.run()) for link in links]
         try:
             relay.start(dict(zip(NAMES, ports, strict=False)))

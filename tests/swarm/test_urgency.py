@@ -86,7 +86,7 @@ def test_a_map_arrives_though_there_is_always_something_more_urgent() -> None:
         for peer in range(2, 12):
             number += 1
             one.post(peer, proposal(number))
-            one.post(peer, FrameRequest(number, 0.0))
+            one.post(peer, FrameRequest(number, 0, 0.0))
         network.run(network.now_s + 0.2)
     assert network.blobs(2) == [BLOB[:5000]]
     assert network.n_bytes > 5 * 5000
@@ -107,16 +107,16 @@ def test_a_newer_message_takes_the_place_of_one_that_waits() -> None:
     transfers = Transfers(DEFAULTS, np.random.default_rng(0))
     for number in range(1000):
         transfers.post(0, NO_MAP)
-        transfers.post(2, FrameRequest(number, 0.0))
-        transfers.post(3, FrameRequest(number, 0.0))
+        transfers.post(2, FrameRequest(number, 0, 0.0))
+        transfers.post(3, FrameRequest(number, 0, 0.0))
         transfers.post(2, proposal(number))
     assert transfers.next_poll_s() == float("-inf")
     outgoing, _ = transfers.poll(0.0)
     assert [(out.peer, decode_payload(out.payload_type, out.payload)) for out in outgoing] == [
         (2, proposal(999)),
         (0, NO_MAP),
-        (2, FrameRequest(999, 0.0)),
-        (3, FrameRequest(999, 0.0)),
+        (2, FrameRequest(999, 0, 0.0)),
+        (3, FrameRequest(999, 0, 0.0)),
     ]
     assert transfers.next_poll_s() is None
 

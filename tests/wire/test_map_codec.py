@@ -206,7 +206,10 @@ def test_golden_bytes_of_a_map_that_began_elsewhere() -> None:
 def test_what_is_no_covariance_of_the_first_keyframe_is_refused() -> None:
     data = encode_map(anchored_map())
     at = len(bytes([PROTOCOL_VERSION, BlobKind.MAP])) + struct.calcsize("<BBHHId8s")
-    for numbers in ([0.0] * 21, [float("nan")] * 21, [-1.0] * 21, [1.0] + [9.0] * 20):
+    signalling = struct.unpack("<d", bytes.fromhex("010000000000f47f"))[0]  # warns when added
+    for numbers in (
+        [0.0] * 21, [float("nan")] * 21, [signalling] * 21, [-1.0] * 21, [1.0] + [9.0] * 20,
+    ):  # fmt: skip
         broken = data[:at] + struct.pack("<21d", *numbers) + data[at + 21 * 8 :]
         with pytest.raises(WireError, match="covariance of its first keyframe"):
             decode_map(broken)
@@ -214,6 +217,14 @@ def test_what_is_no_covariance_of_the_first_keyframe_is_refused() -> None:
         decode_map(data[:2] + bytes([8]) + data[3:])
     with pytest.raises(ValueError, match="anchor_covariance must be a covariance"):
         replace(small_map(), anchor_covariance=-np.eye(6))
+
+
+def test_a_negative_zero_in_the_covariance_stays_one() -> None:
+    covariance = np.diag([1e-4] * 6)
+    data = encode_map(replace(small_map(), anchor_covariance=covariance))
+    at = len(bytes([PROTOCOL_VERSION, BlobKind.MAP])) + struct.calcsize("<BBHHId8s") + 8
+    negative = data[:at] + struct.pack("<d", -0.0) + data[at + 8 :]
+    assert encode_map(decode_map(negative)) == negative != data
 
 
 @given(st.one_of(st.just(b""), st.binary(min_size=8, max_size=8)))

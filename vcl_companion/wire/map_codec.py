@@ -294,10 +294,10 @@ def _take_anchor(reader: Reader) -> Array:
     Raises:
         WireError: it is none.
     """
-    upper = np.zeros((6, 6))
-    upper[_UPPER] = reader.unpack(_ANCHOR)
-    covariance = upper + np.triu(upper, 1).T
-    if not (covariance.any() and is_covariance(covariance)):
+    numbers = reader.unpack(_ANCHOR)
+    covariance = np.zeros((6, 6))
+    covariance[_UPPER] = covariance.T[_UPPER] = numbers
+    if not (any(numbers) and is_covariance(covariance)):
         raise WireError("map: not a covariance of its first keyframe")
     return covariance
 
