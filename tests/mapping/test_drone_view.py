@@ -60,6 +60,21 @@ def test_another_size_than_the_camera_s_is_refused() -> None:
         decode_image(data, CAMERA)
 
 
+def test_an_image_takes_no_more_bytes_than_it_may() -> None:
+    image = texture(Camera(640, 480, 400.0, 400.0, 319.5, 239.5))
+    whole = len(encode_image(image, 80))
+    for share in (0.4, 0.6, 0.9):
+        data = encode_image(image, 80, round(share * whole))
+        assert len(data) <= share * whole
+        # The best that fits, not just any: of the qualities above it the next is too long.
+        assert any(
+            encode_image(image, q) == data and len(encode_image(image, q + 1)) > share * whole
+            for q in range(1, 80)
+        )
+    assert encode_image(image, 80, whole) == encode_image(image, 80)
+    assert encode_image(image, 80, 1) == encode_image(image, 1)
+
+
 def test_a_header_that_claims_a_huge_image_is_refused_by_the_header() -> None:
     data = bytearray(encode_image(texture(), 50))
     struct.pack_into("<HH", data, 26, 16383, 16383)

@@ -54,6 +54,19 @@ def test_a_drone_alone_is_its_own_complete_group() -> None:
     assert group.lacking() == ()
 
 
+def test_of_many_members_those_that_are_needed_most_contribute() -> None:
+    group = Group(SwarmOptions(tuple(range(1, 101)), known_distances=((7, 90, 2.0),)), 50)
+    for member in range(1, 101):
+        if member not in (50, 60):
+            group.map_state(member, MapState(b"a       ", 900, True, tracked=1000 - member), 0.0)
+    assert group.measured == (7, 90)
+    assert group.contributors((1, *group.measured), 6) == (50, 1, 7, 90, 100, 99)
+    # 60 was never heard; who is named twice counts once.
+    assert group.contributors((60, 50, 3, 3), 3) == (50, 3, 100)
+    assert len(group.contributors((), 8)) == 8
+    assert len(group.contributors((), 1000)) == 99
+
+
 def test_peers_join_once_are_lost_after_the_timeout_and_come_back() -> None:
     group = Group(THREE, 1)
     assert group.heartbeat(2, 10.0) == [PeerJoined(2)]

@@ -97,6 +97,7 @@ def test_without_a_map_or_with_updates_turned_off_nobody_votes() -> None:
         ("gather_timeout_s", -1.0),
         ("delivery_wait_s", float("inf")),
         ("lost_s", 0.0),
+        ("contributors", 1),
         ("joiner_frames", 0),
         ("joiner_frames", 9),
         ("joiner_spacing_s", 0.0),

@@ -149,6 +149,7 @@ class Exchange:
             transfers.cancel,
             self._passed.given,
             options.map.keyframe_quality,
+            transfers.image_bytes,
         )
         self._rounds = MapRounds(
             group,

@@ -74,7 +74,8 @@ class FrameAnswers:
         hand: sends an answer to a peer; returns the transfer's id.
         cancel: ends a transfer, one that is over already too.
         given: told of every frame that is given to a peer.
-        keyframe_quality: of the images, 1 to 100.
+        keyframe_quality: of the images, 1 to 100, at most.
+        image_bytes: of an image, at most.
     """
 
     def __init__(
@@ -92,6 +93,7 @@ class FrameAnswers:
         cancel: Callable[[int], None],
         given: Callable[[FrameAnswer], None],
         keyframe_quality: int,
+        image_bytes: int,
     ) -> None:
         self._system_id = system_id
         self._frames = frames
@@ -106,6 +108,7 @@ class FrameAnswers:
         self._cancel = cancel
         self._note_given = given
         self._keyframe_quality = keyframe_quality
+        self._image_bytes = image_bytes
         self._wanted: PeerMailbox[_Wanted] = PeerMailbox()
         self._given: dict[int, _Given] = {}
         self._on_its_way: dict[int, int] = {}
@@ -168,7 +171,9 @@ class FrameAnswers:
         if self._estimator.is_localized(self._clock.now_ns()):
             await self._estimator.looked_at(at_ns, _SETTLE_S)
         state = self._estimator.own_fix_at(at_ns)
-        image_bytes = await self._work.encode(np.asarray(frame.image), self._keyframe_quality)
+        image_bytes = await self._work.encode(
+            np.asarray(frame.image), self._keyframe_quality, self._image_bytes
+        )
         return FrameAnswer(
             drone_id=self._system_id,
             request_id=request_id,

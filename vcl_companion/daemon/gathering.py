@@ -28,12 +28,14 @@ class Wanted:
 
     Attributes:
         at_ns: the instant of every member's first one, our clock.
+        members: who is asked.
         earlier: how many more of some members.
         spacing_s: time between a member's frames.
         timeout_s: how long to wait for all of them.
     """
 
     at_ns: int
+    members: tuple[int, ...]
     earlier: Mapping[int, int] = field(default_factory=dict)
     spacing_s: float = 1.0
     timeout_s: float = 20.0
@@ -108,7 +110,7 @@ class Gathering:
         return self._first_id
 
     async def gather(self, wanted: Wanted, is_over: Callable[[], bool]) -> list[FrameAnswer]:
-        """Ask, again and again, until all have answered, time is up, or ``is_over``.
+        """Ask, again and again, until all asked have answered, time is up, or ``is_over``.
 
         Returns:
             What has come, of each member the latest frame first.
@@ -118,7 +120,8 @@ class Gathering:
         with suppress(TimeoutError):
             async with asyncio.timeout(wanted.timeout_s):
                 while not is_over():
-                    open_ = [peer for peer in self._group.alive if self._is_open(peer, wanted)]
+                    alive = set(self._group.alive).intersection(wanted.members)
+                    open_ = [peer for peer in sorted(alive) if self._is_open(peer, wanted)]
                     if not open_:
                         break
                     for peer in open_:

@@ -236,7 +236,9 @@ class InterTarget:
             ValueError: the frame cannot be encoded, or is larger than peers accept.
         """
         image_bytes = await self._work.encode(
-            np.asarray(asked.frame.image), self._options.request_quality
+            np.asarray(asked.frame.image),
+            self._options.request_quality,
+            self._options.request_bytes,
         )
         attitude = asked.ned_from_body
         frame = FrameAnswer(

@@ -167,7 +167,14 @@ class MapRounds:
     async def _first_map(self, frame: Frame) -> None:
         leader = self._group.leader
         request_id = self._gathering.begin()
-        wanted = Wanted(frame.captured_at_ns, timeout_s=self._options.map.gather_timeout_s)
+        group = self._group
+        # Without the leader there is no world, without a known distance no scale.
+        contributors = group.contributors(
+            (group.leader, *group.measured), self._options.update.contributors
+        )
+        wanted = Wanted(
+            frame.captured_at_ns, contributors, timeout_s=self._options.map.gather_timeout_s
+        )
         frames = await self._gathered(frame, wanted, self._has_map)
         built = await self._built(frames, lambda frames: self._work.first_map(frames, leader))
         if not self._has_map():
@@ -182,8 +189,12 @@ class MapRounds:
         _log.info("the map is updated, %s", reason)
 
         request_id = self._gathering.begin()
+        contributors = self._group.contributors(
+            (*lost, *self._group.wanting_update), update.contributors
+        )
         wanted = Wanted(
             frame.captured_at_ns,
+            contributors,
             dict.fromkeys(lost, update.joiner_frames - 1),
             update.joiner_spacing_s,
             update.gather_timeout_s,

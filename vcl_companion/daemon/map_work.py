@@ -48,9 +48,9 @@ class MapWork:
         self._process = Forked(workshop, _LANES, realtime=realtime) if forks else None
         self._threads: dict[str, Worker] = {}
 
-    async def encode(self, image: Image, quality: int) -> bytes:
+    async def encode(self, image: Image, quality: int, most_bytes: int) -> bytes:
         """See ``Workshop``."""
-        data: bytes = await self._do(_IMAGES, "encode", image, quality)
+        data: bytes = await self._do(_IMAGES, "encode", image, quality, most_bytes)
         return data
 
     async def look_at(self, frame: FrameAnswer) -> None:

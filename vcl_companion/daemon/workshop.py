@@ -86,9 +86,9 @@ class Workshop:
         while len(self._maps) > _N_MAPS:
             del self._maps[next(iter(self._maps))]
 
-    def encode(self, image: Image, quality: int) -> bytes:
+    def encode(self, image: Image, quality: int, most_bytes: int) -> bytes:
         """Return one of our frames as peers get it; see ``encode_image``."""
-        return encode_image(image, quality)
+        return encode_image(image, quality, most_bytes)
 
     def look_at(self, frame: FrameAnswer) -> None:
         """Find the features of a frame that a map will be made of, before it is.

@@ -44,13 +44,32 @@ class DroneView:
         return np.concatenate([f.pixels for f in self.features])
 
 
-def encode_image(image: Image, quality: int) -> bytes:
+def encode_image(image: Image, quality: int, most_bytes: int | None = None) -> bytes:
     """Return a grey image as WebP, the form in which drones exchange it.
 
     Args:
         image: (H, W) uint8.
-        quality: 1 to 100.
+        quality: 1 to 100, at most.
+        most_bytes: the quality is lowered until the bytes are no more; what takes more at
+            quality 1 stays so.
     """
+    data = _encoded(image, quality)
+    if most_bytes is None or len(data) <= most_bytes:
+        return data
+    # Six halvings of 1 to 100, each twenty milliseconds; the length rises with the quality.
+    fits, too_much = 1, quality
+    best = _encoded(image, fits)
+    while too_much - fits > 1:
+        between = (fits + too_much) // 2
+        data = _encoded(image, between)
+        if len(data) <= most_bytes:
+            fits, best = between, data
+        else:
+            too_much = between
+    return best
+
+
+def _encoded(image: Image, quality: int) -> bytes:
     ok, buffer = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])
     if not ok:
         raise ValueError(f"an image of shape {image.shape} cannot be encoded")

@@ -10,6 +10,7 @@ apart, and each must not begin a map of its own.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from vcl_companion.errors import ConfigError
@@ -87,6 +88,7 @@ class Group:
         self.own_id = own_id
         self.members = tuple(sorted(options.members)) or (own_id,)
         self.leader = options.leader or self.members[0]
+        self.measured = tuple(sorted({m for a, b, _ in options.known_distances for m in (a, b)}))
         self._timeout_s = options.heartbeat_timeout_s
         self._heard_at_s: dict[int, float] = {}  # members alive
         self._ever_heard: set[int] = set()
@@ -147,6 +149,27 @@ class Group:
     def state_of(self, member: int) -> MapState | None:
         """Return what a member last said of its map; None if nothing, or it is lost."""
         return self._states.get(member)
+
+    def contributors(self, first: Iterable[int], most: int) -> tuple[int, ...]:
+        """Return members alive whose frames a map is to be made of, this drone among them.
+
+        Of many not all: a map would grow, and take bytes and time, with the swarm.
+
+        Args:
+            first: who is needed most, in this order.
+            most: how many, at most.
+
+        Returns:
+            Those of them that are alive, then who sees least of the map.
+        """
+
+        def seen(member: int) -> int:
+            state = self._states.get(member)
+            return state.tracked if state is not None else 0
+
+        others = sorted(self.alive, key=lambda member: (seen(member), member))
+        order = dict.fromkeys((self.own_id, *first, *others))
+        return tuple(m for m in order if m in self.alive)[:most]
 
     def holders(self, revision: bytes) -> tuple[int, ...]:
         """Return the members alive that hold this revision."""

@@ -25,7 +25,8 @@ class InterMavOptions(InterOptions):
         wait_s: a refused frame waits this long for an answer.
         max_hosts: peers asked at once.
         detector: features to match two drones' images by; among the map's.
-        request_quality: WebP quality of the frame that is sent, 1 to 100.
+        request_quality: WebP quality of the frame that is sent, 1 to 100, at most.
+        request_bytes: of its image, at most: the quality is lowered for it.
     """
 
     every_n_frames: int = 10
@@ -36,6 +37,7 @@ class InterMavOptions(InterOptions):
     max_hosts: int = 2
     detector: Detector = "sift"
     request_quality: int = 60
+    request_bytes: int = 11_500
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -51,6 +53,8 @@ class InterMavOptions(InterOptions):
             raise ValueError(f"max_hosts must lie in 1..16, got {self.max_hosts}")
         if not 1 <= self.request_quality <= 100:
             raise ValueError(f"request_quality must lie in 1..100, got {self.request_quality}")
+        if self.request_bytes < 1000:
+            raise ValueError(f"request_bytes must be 1000 or more, got {self.request_bytes}")
 
 
 # What peers knew so long ago tells no more whether they know better than we do.

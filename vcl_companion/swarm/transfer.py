@@ -68,6 +68,11 @@ class Transfers:
         self._next_turn = itertools.count(1)
 
     @property
+    def image_bytes(self) -> int:
+        """Of a keyframe's image, at most: see ``Pace``."""
+        return self._options.pace.image_bytes
+
+    @property
     def incoming_memory_bytes(self) -> int:
         """Memory that unfinished incoming blobs take."""
         return self._receptions.memory_bytes

@@ -28,20 +28,23 @@ class Pace:
         status_interval_s: how long a sender waits for an answer before it asks
             again (longer every time it gets none); a receiver answers within it.
         give_up_s: a sender without progress for this long fails.
+        image_bytes: of a keyframe's image, at most: its quality is lowered for it. What maps
+            lose by it is some millimetres (docs/network.md).
     """
 
     rate_bytes_per_s: float
     burst_bytes: int
     status_interval_s: float
     give_up_s: float
+    image_bytes: int
 
 
 # A radio of 57,600 baud takes 5,760 bytes/s from us, and the air is everybody's; so 70 %.
 PROFILES: Mapping[Profile, Pace] = MappingProxyType(
     {
-        "wifi": Pace(250_000.0, 8192, 0.2, 30.0),
-        "radio-57k": Pace(4_000.0, 2 * MAX_FRAME_BYTES, 1.0, 60.0),
-        "radio-115k": Pace(8_000.0, 2 * MAX_FRAME_BYTES, 0.6, 45.0),
+        "wifi": Pace(250_000.0, 8192, 0.2, 30.0, 1_000_000),
+        "radio-57k": Pace(4_000.0, 2 * MAX_FRAME_BYTES, 1.0, 60.0, 10_000),
+        "radio-115k": Pace(8_000.0, 2 * MAX_FRAME_BYTES, 0.6, 45.0, 16_000),
     }
 )
 
@@ -51,8 +54,8 @@ class TransferOptions:
     """How fast, how patient and how generous transfers are.
 
     Attributes:
-        profile: the kind of link, which the next four follow from unless they are given.
-        rate_bytes_per_s, burst_bytes, status_interval_s, give_up_s: see ``Pace``.
+        profile: the kind of link, which the next five follow from unless they are given.
+        rate_bytes_per_s, burst_bytes, status_interval_s, give_up_s, image_bytes: see ``Pace``.
         keep_partial_s: a receiver keeps an unfinished blob, and remembers a
             finished one, this long after it last heard of it.
         max_blob_bytes: longest blob accepted.
@@ -66,6 +69,7 @@ class TransferOptions:
     burst_bytes: int | None = None
     status_interval_s: float | None = None
     give_up_s: float | None = None
+    image_bytes: int | None = None
     keep_partial_s: float = 120.0
     max_blob_bytes: int = MAX_BLOB_BYTES
     max_incoming_per_peer: int = 4
@@ -80,6 +84,7 @@ class TransferOptions:
             usual.burst_bytes if self.burst_bytes is None else self.burst_bytes,
             usual.status_interval_s if self.status_interval_s is None else self.status_interval_s,
             usual.give_up_s if self.give_up_s is None else self.give_up_s,
+            usual.image_bytes if self.image_bytes is None else self.image_bytes,
         )
 
     def __post_init__(self) -> None:
@@ -103,6 +108,8 @@ class TransferOptions:
             raise ConfigError(
                 f"burst_bytes must hold one frame of {MAX_FRAME_BYTES}: {pace.burst_bytes}"
             )
+        if pace.image_bytes < 1000:
+            raise ConfigError(f"image_bytes must be 1000 or more: {pace.image_bytes}")
         if not 1 <= self.max_blob_bytes <= MAX_BLOB_BYTES:
             raise ConfigError(
                 f"max_blob_bytes must be 1 to {MAX_BLOB_BYTES}: {self.max_blob_bytes}"

@@ -65,6 +65,7 @@ class UpdateOptions:
         delivery_wait_s: how long a revision may take to reach everybody alive
             before the next round, and how long a peer that claims a map may take
             to deliver it before a first one is made without it.
+        contributors: of how many members' frames a map is made or updated, at most.
         lost_s: a member that has not localized for so long sends several frames.
         joiner_frames: how many.
         joiner_spacing_s: time between them.
@@ -87,6 +88,7 @@ class UpdateOptions:
     interval_s: float = 0.5
     gather_timeout_s: float = 5.0
     delivery_wait_s: float = 30.0
+    contributors: int = 8
     lost_s: float = 3.0
     joiner_frames: int = 4
     joiner_spacing_s: float = 1.5
@@ -116,6 +118,8 @@ class UpdateOptions:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be positive, got {value}")
+        if not 2 <= self.contributors <= 64:
+            raise ValueError(f"contributors must lie in 2..64, got {self.contributors}")
         if not 1 <= self.joiner_frames <= 8:
             raise ValueError(f"joiner_frames must lie in 1..8, got {self.joiner_frames}")
 
