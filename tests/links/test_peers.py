@@ -247,7 +247,7 @@ def test_a_burst_of_a_map_is_not_lost_while_the_receiver_is_busy(key: str) -> No
     ],
 )
 def test_it_is_known_how_often_a_message_to_all_is_sent(to: tuple[str, ...], n_copies: int) -> None:
-    assert Drone(PeerOptions("0.0.0.0:14650", to), 1).link.copies_to_all == n_copies
+    assert Drone(open_to_all("0.0.0.0:14650", *to), 1).link.copies_to_all == n_copies
 
 
 @pytest.mark.parametrize(
