@@ -28,8 +28,8 @@ class Pace:
         status_interval_s: how long a sender waits for an answer before it asks
             again (longer every time it gets none); a receiver answers within it.
         give_up_s: a sender without progress for this long fails.
-        image_bytes: of a keyframe's image, at most: its quality is lowered for it. What maps
-            lose by it is some millimetres (docs/network.md).
+        image_bytes: of a keyframe's image, at most: its quality is lowered for it. Of 10 kB
+            maps are a centimetre or two worse (docs/network.md).
     """
 
     rate_bytes_per_s: float
