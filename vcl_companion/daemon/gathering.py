@@ -1,4 +1,4 @@
-"""The frames of one round: asked of every member alive, several of those that are lost."""
+"""The frames of one round: asked of every member believed, several of those that are lost."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class Gathering:
         with suppress(TimeoutError):
             async with asyncio.timeout(wanted.timeout_s):
                 while not is_over():
-                    open_ = [peer for peer in self._group.alive if self._is_open(peer, wanted)]
+                    open_ = [peer for peer in self._group.trusted if self._is_open(peer, wanted)]
                     if not open_:
                         break
                     for peer in open_:

@@ -91,6 +91,7 @@ class Group:
         self._heard_at_s: dict[int, float] = {}  # members alive
         self._ever_heard: set[int] = set()
         self._states: dict[int, MapState] = {}  # ours, and of members alive
+        self._distrusted: frozenset[int] = frozenset()
 
     @property
     def peers(self) -> tuple[int, ...]:
@@ -101,6 +102,15 @@ class Group:
     def alive(self) -> tuple[int, ...]:
         """Members that are there as far as known, this drone among them, ascending."""
         return tuple(m for m in self.members if m == self.own_id or m in self._heard_at_s)
+
+    @property
+    def trusted(self) -> tuple[int, ...]:
+        """Members alive that are believed, this drone among them, ascending."""
+        return tuple(m for m in self.alive if m not in self._distrusted)
+
+    def distrust(self, peers: frozenset[int]) -> None:
+        """Note who is not believed from now on; all others are."""
+        self._distrusted = peers - {self.own_id}
 
     @property
     def is_complete(self) -> bool:
@@ -153,30 +163,37 @@ class Group:
         return tuple(m for m in self.alive if (s := self._states.get(m)) and s.revision == revision)
 
     def lacking(self) -> tuple[int, ...]:
-        """Return the members alive that do not hold the newest revision; none while there is none.
+        """Return the members trusted that do not hold the newest revision; none without one.
 
         A member that said nothing of its map yet lacks it.
         """
         if not self.newest_revision:
             return ()
         holders = self.holders(self.newest_revision)
-        return tuple(member for member in self.alive if member not in holders)
+        return tuple(member for member in self.trusted if member not in holders)
 
     @property
     def wanting_update(self) -> tuple[int, ...]:
-        """Members alive whose vote is for an update of the newest revision (IV-G).
+        """Members trusted whose vote is for an update of the newest revision (IV-G).
 
         The vote of one that still flies on another revision is about that one,
         and does not count.
         """
         if not self.newest_revision:
             return ()
-        return tuple(m for m in self.holders(self.newest_revision) if self._states[m].wants_update)
+        holders = self.holders(self.newest_revision)
+        return tuple(m for m in self.trusted if m in holders and self._states[m].wants_update)
 
     @property
     def majority_wants_update(self) -> bool:
-        """Whether more than half of the members alive vote for an update."""
-        return 2 * len(self.wanting_update) > len(self.alive)
+        """Whether more than half of the members trusted vote for an update."""
+        return 2 * len(self.wanting_update) > len(self.trusted)
+
+    def most_others_hold(self, revision: bytes) -> bool:
+        """Whether most of the other members trusted, and at least two, hold a revision."""
+        others = [m for m in self.trusted if m != self.own_id]
+        n_holders = len(set(others) & set(self.holders(revision)))
+        return n_holders >= 2 and 2 * n_holders > len(others)
 
     def poll(self, now_s: float) -> list[GroupEvent]:
         """Return who is lost by now, and forget what it had: it may come back without it."""
