@@ -128,7 +128,7 @@ def nobody_to_ask(work: MapWork, clock: ManualClock) -> InterTarget:
     alone = HostChoice(Group(SwarmOptions(), DRONE))
     return InterTarget(
         DRONE, alone, demo.sensor(DRONE), clock, work, lambda _, __: 0, lambda _: None,
-        InterMavOptions(), np.random.default_rng(0), only_the_surer=True,
+        lambda _, __: None, InterMavOptions(), np.random.default_rng(0), only_the_surer=True,
     )  # fmt: skip
 
 

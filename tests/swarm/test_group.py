@@ -144,6 +144,35 @@ def test_a_member_knows_the_newest_map_from_the_coordinator() -> None:
     assert group.lacking() == (3,)
 
 
+def test_who_is_not_believed_is_there_but_counts_for_nothing() -> None:
+    group = Group(SwarmOptions((1, 2, 3, 4)), 1)
+    wants = MapState(b"12345678", 100, True, wants_update=True)
+    group.set_own_state(wants)
+    for peer in (2, 3, 4):
+        group.map_state(peer, wants, 0.0)
+    group.distrust(frozenset({1, 4}))  # never ourselves
+    assert (group.alive, group.trusted) == ((1, 2, 3, 4), (1, 2, 3))
+    assert group.wanting_update == (1, 2, 3)
+    assert group.holders(wants.revision) == (1, 2, 3, 4)
+    for peer in (3, 4):
+        group.map_state(peer, OLD, 1.0)
+    assert group.lacking() == (3,)
+    group.distrust(frozenset())
+    assert group.trusted == group.alive
+    assert group.lacking() == (3, 4)
+
+
+def test_others_outvote_us_when_most_of_them_and_two_at_least_hold_a_map() -> None:
+    group = Group(SwarmOptions((1, 2, 3, 4)), 1)
+    group.map_state(2, NEW, 0.0)
+    assert not group.most_others_hold(NEW.revision)  # one word
+    group.map_state(3, NEW, 0.0)
+    group.map_state(4, OLD, 0.0)
+    assert group.most_others_hold(NEW.revision)
+    group.distrust(frozenset({3}))
+    assert not group.most_others_hold(NEW.revision)
+
+
 @given(st.lists(st.tuples(st.integers(1, 4), st.floats(0.0, 100.0)), max_size=40))
 def test_whatever_is_heard_alive_is_who_was_heard_lately(heard: list[tuple[int, float]]) -> None:
     group = Group(THREE, 1)

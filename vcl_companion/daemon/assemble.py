@@ -242,6 +242,7 @@ async def _run(config: Config) -> int:
                 resident_mb=max(began_mb, peak_resident_mb() + taken.peak_mb),
                 peer_bytes_sent=peers.counters.bytes_out,
                 peer_bytes_received=peers.counters.bytes_in,
+                quarantined=dict(exchange.trust.n_terms),
             )
     for worker in (vision, disk):
         worker.exit_status = 0

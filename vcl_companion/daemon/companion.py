@@ -373,6 +373,10 @@ class Companion:
             at_ns, asked.ned_from_body, pose, covariance, stored.index
         )
         why = state.reason if isinstance(state, NotFused) else ""
+        # Without a fix of our own one peer may only be said to contradict another.
+        tells = not isinstance(state, NotFused) or state.contradicts
+        if tells and self._estimator.has_own_fix_near(at_ns):
+            self._inter.judged(host, why)
         self._log.estimate(at_ns, pose, covariance, fused=not why, host=host, reason=why)
         return None if isinstance(state, NotFused) else state
 

@@ -36,6 +36,8 @@ HISTORY_S = 5.0
 # A fix this old is no more where we are.
 _FRESH_NS = 2_000_000_000
 _LEAST_ARM_M = 1.0
+# Nobody flies faster than so many sigmas of the speed, nor is further from where he was.
+_FASTEST_SIGMAS = 5.0
 
 
 class Estimator:
@@ -59,6 +61,7 @@ class Estimator:
         self._history = PoseHistory(HISTORY_S, options)
         self._n_contradicted = 0
         self._has_begun = False
+        self._own_fix: FilterState | None = None
         self._looked_at_ns = -1
         self._looked = asyncio.Event()
         self.n_resets = 0
@@ -179,6 +182,7 @@ class Estimator:
         self.tracked, self.covered = fix.n_seen, fix.covered
         self.novelty_deg = fix.novelty_deg
         self._history.append(state, fix, ned_from_body)
+        self._own_fix = state
         self._note(at_ns)
         return state
 
@@ -214,7 +218,10 @@ class Estimator:
         if ned_from_body is not None:
             reason = disagreement(world_from_body.rotation, ned_from_body, self._localization)
             if reason:
-                return NotFused(reason)
+                return NotFused(reason, contradicts=True)
+        too_far = self._too_far(at_ns, world_from_body, covariance)
+        if too_far:
+            return NotFused(too_far, contradicts=True)
         if self._history.newest is None:
             state = started_from_proposal(
                 world_from_body, covariance, at_ns, ned_from_body, self._options
@@ -230,6 +237,30 @@ class Estimator:
         if isinstance(fused, NotFused):
             return fused
         return self._history.at(at_ns) or fused
+
+    def has_own_fix_near(self, at_ns: int) -> bool:
+        """Whether a fix of our own, not two seconds from an instant, says where we were then."""
+        own = self._own_fix
+        return own is not None and abs(at_ns - own.at_ns) <= _FRESH_NS
+
+    def _too_far(self, at_ns: int, world_from_body: Pose, covariance: Array) -> str:
+        """Say how a pose cannot be reached from our last own fix; empty if it can.
+
+        The filter's own gate widens with the square of the time, and there is none where it
+        has begun anew; soon after a fix it is the narrower one.
+        """
+        own = self._own_fix
+        if own is None or self.has_own_fix_near(at_ns):
+            return ""
+        away = world_from_body.translation - own.world_from_body.translation
+        metres = float(np.linalg.norm(away))
+        since_s = abs(at_ns - own.at_ns) * 1e-9
+        spread = own.pose_covariance()[:3, :3] + covariance[:3, :3]
+        sigma_m = math.sqrt(float(np.linalg.eigvalsh(spread)[-1]))
+        reach_m = _FASTEST_SIGMAS * (self._options.speed_m_s * since_s + sigma_m)
+        if metres <= reach_m + _LEAST_ARM_M:
+            return ""
+        return f"{metres:.1f} m from our last own fix, {since_s:.1f} s away from it"
 
     def _is_late(self, at_ns: int) -> bool:
         """Whether a later frame has been taken in already."""

@@ -31,6 +31,7 @@ from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.daemon.peer_clocks import PeerClocks
+from vcl_companion.daemon.peer_trust import PeerTrust
 from vcl_companion.daemon.refusals import Refusals
 from vcl_companion.errors import WireError
 from vcl_companion.links.autopilot import AutopilotLink
@@ -41,6 +42,7 @@ from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.group import Group, PeerJoined, PeerLost, SwarmOptions
 from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
+from vcl_companion.swarm.quarantine import Evidence
 from vcl_companion.swarm.transfer import (
     BlobDelivered,
     BlobKind,
@@ -54,6 +56,7 @@ from vcl_companion.swarm.urgency import Message
 from vcl_companion.vision.features import Detector
 from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.frame_codec import decode_frame
+from vcl_companion.wire.header import VersionMismatchError
 from vcl_companion.wire.messages import MAX_TRACKED, FrameRequest, MapRefused, MapState
 from vcl_companion.wire.pose_messages import PoseProposal, PoseRefused
 from vcl_companion.wire.tunnel import TunnelPayload, decode_payload, is_ours
@@ -125,6 +128,8 @@ class Exchange:
         self._options = options
         self._link: PeerLink | None = None
         self._refusals = Refusals(log)
+        self.trust = PeerTrust(group, autopilot, log, self._turn_away)
+        self._n_resets = 0
         self.clocks = PeerClocks(
             group, self._ask_time, clock, log, self._refusals.count, options.clock_resolution_ns
         )
@@ -176,6 +181,7 @@ class Exchange:
             disk,
             self._tell_state,
             self._refusals.count,
+            self.trust,
             self._passed,
             options.update.delivery_wait_s,
             len(options.detectors) > 1,
@@ -188,6 +194,7 @@ class Exchange:
             work,
             partial(self._hand, BlobKind.POSE_REQUEST),
             transfers.cancel,
+            self.trust.judged,
             options.inter,
             rng,
             only_the_surer=options.tracked,
@@ -198,6 +205,7 @@ class Exchange:
             estimator,
             self._send,
             self._refusals.count,
+            self.trust.why_not,
             clock,
             self.clocks,
             work,
@@ -234,7 +242,7 @@ class Exchange:
         try:
             message = decode_payload(tunnel.payload_type, tunnel.payload)
         except WireError as error:
-            self._refusals.count(tunnel.sender_system, "payload", str(error))
+            self._malformed(tunnel.sender_system, "payload", error)
             return
         self._accept(tunnel.sender_system, message, to_all=tunnel.target_system == 0)
         self._wake.set()
@@ -255,6 +263,7 @@ class Exchange:
         while True:
             now_s = self._now_s()
             self._note(self._group.poll(now_s))
+            self._review()
             if self._voted(now_s) or now_s - told_at_s >= _STATE_INTERVAL_S:
                 told_at_s = now_s
                 self._tell_state()
@@ -269,6 +278,10 @@ class Exchange:
 
     def _accept(self, peer: int, message: TunnelPayload, *, to_all: bool) -> None:
         now_s = self._now_s()
+        if not isinstance(message, Chunk | TransferStatus):
+            self.trust.heard(peer)
+            if not isinstance(message, MapState) and self._is_barred(peer, "message"):
+                return
         match message:
             case Chunk() | TransferStatus():
                 self._take_events(self._transfers.receive(peer, message, now_s, to_all=to_all))
@@ -308,17 +321,45 @@ class Exchange:
                     self._log.event("transfer", f"to drone {peer}: {reason}")
                     _log.warning("transfer to drone %d failed: %s", peer, reason)
 
+    def _is_barred(self, peer: int, kind: str) -> bool:
+        """Whether something is not taken because of who says it; that is counted."""
+        if not self.trust.why_not(peer):
+            return False
+        self._refusals.count(peer, f"{kind} of a quarantined drone")
+        return True
+
+    def _malformed(self, peer: int, kind: str, error: WireError) -> None:
+        """Count bytes that no drone sends; another version's are only not understood."""
+        self._refusals.count(peer, kind, str(error))
+        if not isinstance(error, VersionMismatchError):
+            self.trust.note(peer, Evidence.MALFORMED, f"{kind}: {error}")
+
+    def _review(self) -> None:
+        """Let who was quarantined go when it is time, and poses that ours has come round to."""
+        if self._estimator.n_resets != self._n_resets:
+            self._n_resets = self._estimator.n_resets
+            self.trust.was_wrong()
+        self.trust.poll()
+
+    def _turn_away(self, peer: int) -> None:
+        """Wait for nothing of a peer that is not believed any more."""
+        self.inter.lost(peer)
+
     def _take_frame(self, peer: int, blob: bytes) -> None:
+        if self._is_barred(peer, "frame"):
+            return
         try:
             frame = decode_frame(blob)
         except WireError as error:
-            self._refusals.count(peer, "frame", str(error))
+            self._malformed(peer, "frame", error)
             return
         refusal = self._rounds.take(peer, frame)
         if refusal is not None:
             self._refusals.count(peer, refusal)
 
     def _take_passed(self, peer: int, blob: bytes) -> None:
+        if self._is_barred(peer, "frame"):
+            return
         try:
             self._passed.take(peer, blob)
         except WireError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Literal
@@ -156,7 +157,7 @@ class FlightLog:
             drift_bound_ppm=relation.drift_bound * 1e6,
         )
 
-    def close(self, **summary: float) -> None:
+    def close(self, **summary: float | Mapping[int, int]) -> None:
         """Write the totals and let go of the file; what comes later is not written."""
         self._write(
             kind="summary", frames=dict(self.frames), refusals=dict(self.refusals), **summary

@@ -1,4 +1,4 @@
-"""The frames of one round: asked of every member alive, several of those that are lost."""
+"""The frames of one round: asked of every member believed, several of those that are lost."""
 
 from __future__ import annotations
 
@@ -120,8 +120,8 @@ class Gathering:
         with suppress(TimeoutError):
             async with asyncio.timeout(wanted.timeout_s):
                 while not is_over():
-                    alive = set(self._group.alive).intersection(wanted.members)
-                    open_ = [peer for peer in sorted(alive) if self._is_open(peer, wanted)]
+                    believed = set(self._group.trusted).intersection(wanted.members)
+                    open_ = [peer for peer in sorted(believed) if self._is_open(peer, wanted)]
                     if not open_:
                         break
                     for peer in open_:

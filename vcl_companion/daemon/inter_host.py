@@ -48,6 +48,7 @@ class InterHost:
         estimator: what we believed when these were taken.
         answer: sends a message to a peer.
         refuse: counts what a peer sent in vain: peer, kind, detail.
+        why_not: says why nothing is done for a peer; empty if it is.
         clock: time base of frames.
         clocks: whose instants are when.
         work: does the vision, beside our own frames'.
@@ -64,6 +65,7 @@ class InterHost:
         estimator: Estimator,
         answer: Callable[[PoseProposal | PoseRefused, int], None],
         refuse: Callable[[int, str, str], None],
+        why_not: Callable[[int], str],
         clock: Clock,
         clocks: PeerClocks,
         work: MapWork,
@@ -77,6 +79,7 @@ class InterHost:
         self._estimator = estimator
         self._answer = answer
         self._refuse = refuse
+        self._why_not = why_not
         self._clock = clock
         self._clocks = clocks
         self._work = work
@@ -119,6 +122,9 @@ class InterHost:
         if stored is None or stored.revision != request.revision:
             return NoProposal("the host flies on another map")
         asked = request.frame
+        why_not = self._why_not(asked.drone_id)
+        if why_not:
+            return NoProposal(why_not)
         instant = self._clocks.instant(
             asked.drone_id, asked.captured_at_ns, asked.frame_age_s, came_at_ns
         )

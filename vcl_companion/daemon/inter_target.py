@@ -79,6 +79,8 @@ class InterTarget:
         work: does the encoding.
         hand: sends a blob of a request to a peer; returns the transfer's id.
         cancel: ends a transfer, one that is over already too.
+        judged: told of every proposal whether it fits what we know ourselves: the peer, and
+            how it does not.
         options: how often, how many, how long.
         rng: numbers the requests.
         only_the_surer: whether a localized frame asks only while a peer may know better
@@ -94,6 +96,7 @@ class InterTarget:
         work: MapWork,
         hand: Callable[[int, bytes], int],
         cancel: Callable[[int], None],
+        judged: Callable[[int, str], None],
         options: InterMavOptions,
         rng: np.random.Generator,
         only_the_surer: bool,
@@ -106,6 +109,7 @@ class InterTarget:
         self._only_the_surer = only_the_surer
         self._hand = hand
         self._cancel = cancel
+        self.judged = judged
         self._options = options
         self._request_id = int(rng.integers(1 << 32))
         self._n_since = 0

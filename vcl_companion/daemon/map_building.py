@@ -5,6 +5,7 @@ from __future__ import annotations
 from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.rotation import matrix_from_quaternion
+from vcl_companion.mapping.agreement import contradiction
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
@@ -70,7 +71,7 @@ def update_map(
     """
     shown = {(f.drone_id, f.captured_at_ns): f for f in frames}
     views = [_seen(shown[key], ()) for key in sorted(shown)]
-    return extended(
+    made = extended(
         stored.index.landmark_map,
         stored.revision,
         views,
@@ -80,6 +81,11 @@ def update_map(
         sure=stored.index.uncertainty,
         at_once=at_once,
     )
+    if isinstance(made, NoMap):
+        return made
+    # Every member would refuse it.
+    why = contradiction(stored.index.landmark_map, stored.index.uncertainty, made)
+    return NoMap(f"it contradicts the map in use: {why}") if why else made
 
 
 def _view(frame: FrameAnswer, map_options: MapOptions, memory: FeatureMemory) -> DroneView | NoMap:

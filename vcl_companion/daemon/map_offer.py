@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.localization.map_index import MapIndex, index_map
+from vcl_companion.mapping.agreement import contradiction, have_common_keyframes
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.mapping.uncertainty import MapUncertainty
@@ -59,12 +60,17 @@ class HandOut:
 
 @dataclass(frozen=True, eq=False)
 class ReadyMap:
-    """A map that can be flown on; the fields are those of ``StoredMap``."""
+    """A map that can be flown on; the other fields are those of ``StoredMap``.
+
+    Attributes:
+        contradicts: how it contradicts the map in use; empty when it does not.
+    """
 
     data: bytes
     index: MapIndex
     update: bytes
     templates: Templates | None
+    contradicts: str = ""
 
     def stored(self) -> StoredMap:
         """Return it as it is held while it is in use."""
@@ -110,7 +116,16 @@ def ready_map(
     if parent is not None and not update:
         update = encode_map_update(data, parent)
     templates = prepare_templates(index.landmark_map, index.uncertainty) if tracked else None
-    return ReadyMap(data, index, update, templates)
+    contradicts = "" if current is None else _contradiction(current, index.landmark_map)
+    return ReadyMap(data, index, update, templates, contradicts)
+
+
+def _contradiction(current: StoredMap, landmark_map: LandmarkMap) -> str:
+    """Say how a map contradicts the one in use; empty if it does not."""
+    own = current.index.landmark_map
+    if landmark_map.parent == current.revision and not have_common_keyframes(own, landmark_map):
+        return "made from ours, it has none of its keyframes"
+    return contradiction(own, current.index.uncertainty, landmark_map)
 
 
 def with_fallbacks(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -19,11 +20,13 @@ from vcl_companion.daemon.map_offer import HandOut, MapOffer, ReadyMap
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
+from vcl_companion.daemon.peer_trust import PeerTrust
 from vcl_companion.daemon.usage import give_back_freed
 from vcl_companion.errors import WireError
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import NoMap
 from vcl_companion.swarm.group import Group
+from vcl_companion.swarm.quarantine import Evidence
 from vcl_companion.swarm.transfer import BlobKind, Transfers
 from vcl_companion.wire.map_update import images_in_update, images_missing_in, without_images
 
@@ -42,6 +45,8 @@ _FOLLOWS_S = 5.0
 _STAYS_S = 3.0
 # A map that was refused may come again after this: we may know better by then.
 _LOOK_AGAIN_S = 5.0
+# Maps remembered as such; one that is forgotten counts once more.
+_N_CONTRADICTING = 64
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,7 @@ class MapSharing:
         disk: runs the writing.
         tell_state: tells peers which map we fly on.
         refuse: counts what a peer sent in vain: peer, kind, detail.
+        trust: told whose maps contradict ours, says whose are not taken.
         passed: who was sent which image ahead.
         delivery_wait_s: how long a coordinator that is back with a map which we
             have left may take to be brought up to date; then it has its way.
@@ -91,6 +97,7 @@ class MapSharing:
         disk: Executor,
         tell_state: Callable[[], None],
         refuse: Callable[[int, str, str], None],
+        trust: PeerTrust,
         passed: PassedFrames,
         delivery_wait_s: float,
         falls_back: bool,
@@ -103,9 +110,11 @@ class MapSharing:
         self._disk = disk
         self._tell_state = tell_state
         self._refuse = refuse
+        self._trust = trust
         self._passed = passed
         self._delivery_wait_s = delivery_wait_s
         self._falls_back = falls_back
+        self._contradicting: deque[tuple[int, bytes]] = deque(maxlen=_N_CONTRADICTING)
         self._offered: PeerMailbox[MapOffer] = PeerMailbox()
         self._handed: dict[int, _Handed] = {}
         self._update: _Update | None = None
@@ -156,10 +165,27 @@ class MapSharing:
                     self._reject(peer, offer, "map", ready.reason)
                     continue
                 why_not = self._why_not(peer, offer)  # again: preparing took a while
+                if why_not is None and self._contradicts(peer, offer, ready):
+                    self._reject(peer, offer, "map that contradicts ours", ready.contradicts)
+                    continue
                 if why_not is None:
                     await self._install(ready)
                     continue
             self._reject(peer, offer, why_not)
+
+    def _contradicts(self, peer: int, offer: MapOffer, ready: ReadyMap) -> bool:
+        """Whether a map is not taken for what it says; that speaks against who offers it.
+
+        Where most others fly on it, it is ours that is wrong. The same map, offered again,
+        says nothing new of the peer.
+        """
+        if not ready.contradicts or self._group.most_others_hold(offer.revision):
+            self._trust.note(peer, Evidence.MAP_TAKEN)
+            return False
+        if (peer, offer.revision) not in self._contradicting:
+            self._contradicting.append((peer, offer.revision))
+            self._trust.note(peer, Evidence.MAP_CONTRADICTED, f"map: {ready.contradicts}")
+        return True
 
     async def adopt(self, built: LandmarkMap, instead_of: StoredMap | None) -> NoMap | None:
         """Fly on a map of our own, exactly as peers will decode it, and hand it out meanwhile.
@@ -266,15 +292,18 @@ class MapSharing:
     def _why_not(self, peer: int, offer: MapOffer) -> str | None:
         """Return why we do not fly on a peer's map, or None if we do.
 
-        Anybody's is taken while we have none, later only the coordinator's. The
+        Anybody's who is believed is taken while we have none, later only the coordinator's. The
         coordinator itself takes one that goes on from its own, or that most fly on.
         """
         group, current = self._group, self._maps.current
+        if self._trust.why_not(peer):
+            return "map of a quarantined drone"
         if current is None:
             return None
         if group.is_coordinator:
             holders = group.holders(offer.revision)
-            if 2 * len(holders) > len(group.alive) or offer.parent == current.revision:
+            n_holders = sum(member in group.trusted for member in holders)
+            if 2 * n_holders > len(group.trusted) or offer.parent == current.revision:
                 return None
         if peer != group.coordinator:
             return "map, but not from the coordinator"

@@ -224,6 +224,10 @@ class AutopilotLink:
         self._said = (severity, text)
         self._send_text(severity, text)
 
+    def announce(self, severity: Severity, text: str) -> None:
+        """Send STATUSTEXT of something that has happened: once, whatever the link does."""
+        self._send_text(severity, text)
+
     def _send_text(self, severity: Severity, text: str) -> None:
         # Ground stations differ in what they make of a character cut in two by a chunk.
         data = text.encode("ascii", "replace")[:_MAX_TEXT_BYTES]

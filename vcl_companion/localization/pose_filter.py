@@ -270,9 +270,15 @@ def update(predicted: FilterState, fix: Localized) -> FilterState | NotLocalized
 
 @dataclass(frozen=True)
 class NotFused:
-    """A proposal was not taken, and why."""
+    """A proposal was not taken, and why.
+
+    Attributes:
+        reason: for people.
+        contradicts: whether it says otherwise than what we know; else it came too late.
+    """
 
     reason: str
+    contradicts: bool = False
 
 
 def fuse(
@@ -304,7 +310,7 @@ def fuse(
     distance = unlikeness(state.world_from_body, own, world_from_body, covariance)
     if not distance <= _GATE_POSE:
         metres = np.linalg.norm(world_from_body.translation - state.world_from_body.translation)
-        return NotFused(f"{metres:.1f} m from where we are, more than both sigmas explain")
+        return NotFused(f"{metres:.1f} m from where we are, more than both sigmas explain", True)
     units = np.diag([1.0, 1.0, 1.0, arm_m, arm_m, arm_m]) ** 2
     if np.trace(units @ weighed.covariance) > _NEWS * np.trace(units @ own):
         # Widening what the proposal says nothing of would cost more.

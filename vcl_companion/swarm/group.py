@@ -93,6 +93,7 @@ class Group:
         self._heard_at_s: dict[int, float] = {}  # members alive
         self._ever_heard: set[int] = set()
         self._states: dict[int, MapState] = {}  # ours, and of members alive
+        self._distrusted: frozenset[int] = frozenset()
 
     @property
     def peers(self) -> tuple[int, ...]:
@@ -103,6 +104,15 @@ class Group:
     def alive(self) -> tuple[int, ...]:
         """Members that are there as far as known, this drone among them, ascending."""
         return tuple(m for m in self.members if m == self.own_id or m in self._heard_at_s)
+
+    @property
+    def trusted(self) -> tuple[int, ...]:
+        """Members alive that are believed, this drone among them, ascending."""
+        return tuple(m for m in self.alive if m not in self._distrusted)
+
+    def distrust(self, peers: frozenset[int]) -> None:
+        """Note who is not believed from now on; all others are."""
+        self._distrusted = peers - {self.own_id}
 
     @property
     def is_complete(self) -> bool:
@@ -151,7 +161,7 @@ class Group:
         return self._states.get(member)
 
     def contributors(self, first: Iterable[int], most: int) -> tuple[int, ...]:
-        """Return members alive whose frames a map is to be made of, this drone among them.
+        """Return members alive and believed whose frames a map is to be made of, and this drone.
 
         Of many not all: a map would grow, and take bytes and time, with the swarm.
 
@@ -160,46 +170,53 @@ class Group:
             most: how many, at most.
 
         Returns:
-            Those of them that are alive, then who sees least of the map.
+            Those of them that there are, then who sees least of the map.
         """
 
         def seen(member: int) -> int:
             state = self._states.get(member)
             return state.tracked if state is not None else 0
 
-        others = sorted(self.alive, key=lambda member: (seen(member), member))
+        others = sorted(self.trusted, key=lambda member: (seen(member), member))
         order = dict.fromkeys((self.own_id, *first, *others))
-        return tuple(m for m in order if m in self.alive)[:most]
+        return tuple(m for m in order if m in self.trusted)[:most]
 
     def holders(self, revision: bytes) -> tuple[int, ...]:
         """Return the members alive that hold this revision."""
         return tuple(m for m in self.alive if (s := self._states.get(m)) and s.revision == revision)
 
     def lacking(self) -> tuple[int, ...]:
-        """Return the members alive that do not hold the newest revision; none while there is none.
+        """Return the members trusted that do not hold the newest revision; none without one.
 
         A member that said nothing of its map yet lacks it.
         """
         if not self.newest_revision:
             return ()
         holders = self.holders(self.newest_revision)
-        return tuple(member for member in self.alive if member not in holders)
+        return tuple(member for member in self.trusted if member not in holders)
 
     @property
     def wanting_update(self) -> tuple[int, ...]:
-        """Members alive whose vote is for an update of the newest revision (IV-G).
+        """Members trusted whose vote is for an update of the newest revision (IV-G).
 
         The vote of one that still flies on another revision is about that one,
         and does not count.
         """
         if not self.newest_revision:
             return ()
-        return tuple(m for m in self.holders(self.newest_revision) if self._states[m].wants_update)
+        holders = self.holders(self.newest_revision)
+        return tuple(m for m in self.trusted if m in holders and self._states[m].wants_update)
 
     @property
     def majority_wants_update(self) -> bool:
-        """Whether more than half of the members alive vote for an update."""
-        return 2 * len(self.wanting_update) > len(self.alive)
+        """Whether more than half of the members trusted vote for an update."""
+        return 2 * len(self.wanting_update) > len(self.trusted)
+
+    def most_others_hold(self, revision: bytes) -> bool:
+        """Whether most of the other members trusted, and at least two, hold a revision."""
+        others = [m for m in self.trusted if m != self.own_id]
+        n_holders = len(set(others) & set(self.holders(revision)))
+        return n_holders >= 2 and 2 * n_holders > len(others)
 
     def poll(self, now_s: float) -> list[GroupEvent]:
         """Return who is lost by now, and forget what it had: it may come back without it."""

@@ -109,12 +109,15 @@ class HostChoice:
         self._told_at_ns[peer] = at_ns
 
     def _able(self, revision: bytes) -> list[int]:
-        """Return the peers that are localized in a map."""
+        """Return the peers that are localized in a map, and believed."""
         group = self._group
         return [
             peer
             for peer in group.holders(revision)
-            if peer != group.own_id and (state := group.state_of(peer)) and state.localized
+            if peer != group.own_id
+            and peer in group.trusted
+            and (state := group.state_of(peer))
+            and state.localized
         ]
 
     def lost(self, peer: int) -> None:

@@ -1,0 +1,65 @@
+"""What a peer's proposal may do to a drone that has not seen the map for long."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.daemon import demo
+from vcl_companion.daemon.estimator import Estimator
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.localization.intra import LocalizationOptions, Localized
+from vcl_companion.localization.pose_filter import FilterOptions, FilterState, NotFused
+
+SURE = np.diag([0.02] * 3 + [0.002] * 3) ** 2
+SPEED_M_S = FilterOptions().speed_m_s
+
+
+def after_a_fix(silent_s: float) -> tuple[Estimator, int]:
+    """A drone that saw the map at the origin, and for so long nothing since."""
+    estimator = Estimator(FilterOptions(), LocalizationOptions(), lambda _: None)
+    fix = Localized(
+        Pose.identity(), SURE, 1e-6 * np.eye(6), np.zeros((6, 0)), np.zeros((0, 0)),
+        50, 50, False, 0.5,
+    )  # fmt: skip
+    estimator.take_fix(None, fix, 0, None)
+    at_ns = round(silent_s * 1e9)
+    estimator.take_nothing(estimator.predicted(at_ns, None), at_ns, None)
+    return estimator, at_ns
+
+
+def proposed(estimator: Estimator, at_ns: int, metres: float) -> FilterState | NotFused:
+    there = Pose(np.eye(3), np.array([metres, 0.0, 0.0]))
+    return estimator.take_proposal(at_ns, None, there, SURE, demo.map_index(1, 2))
+
+
+@pytest.mark.parametrize("silent_s", [20.0, 59.0, 90.0])
+def test_nobody_is_taken_for_faster_than_he_flies(silent_s: float) -> None:
+    """By its covariance alone, or for want of any, the filter would believe a kilometre."""
+    estimator, at_ns = after_a_fix(silent_s)
+    assert not estimator.has_own_fix_near(at_ns)
+    reach_m = 5.0 * SPEED_M_S * silent_s
+    far = proposed(estimator, at_ns, 1.1 * reach_m)
+    assert isinstance(far, NotFused)
+    assert far.contradicts
+    assert far.reason.endswith(f"m from our last own fix, {silent_s:.1f} s away from it")
+    near = proposed(estimator, at_ns, 0.2 * reach_m)
+    assert isinstance(near, FilterState)
+    assert abs(near.world_from_body.translation[0] - 0.2 * reach_m) < 0.1
+
+
+def test_what_comes_too_late_contradicts_nothing() -> None:
+    estimator, at_ns = after_a_fix(1.0)
+    late = proposed(estimator, at_ns - 500_000_000, 0.0)
+    assert isinstance(late, NotFused)
+    assert not late.contradicts
+    off = proposed(estimator, 0, 5.0)
+    assert isinstance(off, NotFused)
+    assert off.contradicts
+    assert estimator.has_own_fix_near(0)
+
+
+def test_a_drone_that_has_seen_nothing_yet_is_placed_by_its_peers() -> None:
+    estimator = Estimator(FilterOptions(), LocalizationOptions(), lambda _: None)
+    assert isinstance(proposed(estimator, 0, 900.0), FilterState)
+    assert not estimator.has_own_fix_near(0)

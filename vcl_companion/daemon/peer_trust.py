@@ -1,0 +1,113 @@
+"""Peers that are not believed for a while: what follows from it here, and who is told.
+
+A quarantined drone is still heard, and handed maps: it may be right again. What it says
+of poses and maps, its frames, its requests and its vote count for nothing until its term
+is over (``swarm/quarantine.py``).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Mapping
+
+from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.links.autopilot import AutopilotLink, Severity
+from vcl_companion.links.mavlink import STATUS_TEXT_BYTES
+from vcl_companion.swarm.group import Group
+from vcl_companion.swarm.quarantine import Evidence, Quarantine, Quarantined, QuarantineOptions
+
+_log = logging.getLogger(__name__)
+
+# One text in this time: several drones may be found out at once, and others have to say more.
+_SAY_S = 1.0
+
+
+class PeerTrust:
+    """Collects evidence against peers, and says whom it has turned against.
+
+    Args:
+        group: told whose votes do not count.
+        autopilot: told of every change, for the ground.
+        log: likewise.
+        turned_away: told whose answers nobody waits for any more.
+        options: thresholds and terms.
+    """
+
+    def __init__(
+        self,
+        group: Group,
+        autopilot: AutopilotLink,
+        log: FlightLog,
+        turned_away: Callable[[int], None],
+        options: QuarantineOptions | None = None,
+    ) -> None:
+        self._group = group
+        self._autopilot = autopilot
+        self._log = log
+        self._turned_away = turned_away
+        self._quarantine = Quarantine(options or QuarantineOptions())
+        self._unsaid: dict[int, tuple[Severity, str]] = {}
+        self._said_at_s = float("-inf")
+
+    @property
+    def n_terms(self) -> Mapping[int, int]:
+        """How often each peer was quarantined, who ever was."""
+        return self._quarantine.n_terms
+
+    def why_not(self, peer: int) -> str:
+        """Return why a peer is not believed now; empty if it is."""
+        why = self._quarantine.why(peer)
+        return f"quarantined: {why}" if why else ""
+
+    def note(self, peer: int, evidence: Evidence, why: str = "") -> None:
+        """Take what speaks against a peer, or for it."""
+        self._begin(self._quarantine.note(peer, evidence, why, self._now_s()))
+
+    def heard(self, peer: int) -> None:
+        """Count a message of a peer: there may be too many."""
+        self._begin(self._quarantine.message(peer, self._now_s()))
+
+    def judged(self, peer: int, contradiction: str) -> None:
+        """Take whether the pose that a peer proposed fits our own; empty: it was taken."""
+        if contradiction:
+            self.note(peer, Evidence.POSE_CONTRADICTED, f"pose {contradiction}")
+        else:
+            self.note(peer, Evidence.POSE_TAKEN)
+
+    def was_wrong(self) -> None:
+        """Hold no pose against anybody: our own has jumped, so it was not theirs that was off."""
+        self._quarantine.forgive(Evidence.POSE_CONTRADICTED)
+
+    def poll(self) -> None:
+        """Release whose term is over, and say what has not been said; call it several times/s."""
+        for released in self._quarantine.poll(self._now_s()):
+            self._log.event("released", f"drone {released.peer}")
+            _log.info("drone %d is believed again", released.peer)
+            self._unsaid[released.peer] = (
+                Severity.NOTICE,
+                f"VCL: drone {released.peer} believed again",
+            )
+            self._group.distrust(self._quarantine.peers)
+        self._say_next()
+
+    def _begin(self, term: Quarantined | None) -> None:
+        if term is None:
+            return
+        for_s = term.until_s - self._now_s()
+        self._log.event("quarantine", f"drone {term.peer} for {for_s:.0f} s: {term.why}")
+        _log.warning("drone %d is quarantined for %.0f s: %s", term.peer, for_s, term.why)
+        text = f"VCL: drone {term.peer} quarantined: {term.why}"
+        self._unsaid[term.peer] = (Severity.WARNING, text[:STATUS_TEXT_BYTES])
+        self._group.distrust(self._quarantine.peers)
+        self._turned_away(term.peer)
+        self._say_next()
+
+    def _say_next(self) -> None:
+        """Say one thing, of each drone the newest only."""
+        if self._unsaid and self._now_s() >= self._said_at_s + _SAY_S:
+            self._said_at_s = self._now_s()
+            self._autopilot.announce(*self._unsaid.pop(next(iter(self._unsaid))))
+
+    def _now_s(self) -> float:
+        return asyncio.get_running_loop().time()

@@ -1,0 +1,154 @@
+"""Whether another map says the same of the world as the one in use: frame, scale, landmarks.
+
+Maps come from peers, and one that is wrong would take every drone that flies on it along.
+What both maps know, keyframes of the same drone and instant and the landmarks seen there,
+must be where it was, as far as the one in use knows that itself; what the other one says of
+its own accuracy does not count.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.uncertainty import MapUncertainty
+
+# Squared Mahalanobis distance that one in 10 000 exceeds, in six and in three dimensions.
+_CHI2_6, _CHI2_3 = 27.9, 21.1
+# What is taken to be exact moves this much when a map is adjusted anew or rounded.
+_LEAST_M, _LEAST_RAD = 0.02, 0.005
+# However vague the map in use is: no keyframe or landmark moves by more than such a share of
+# how far the scene is from the keyframes.
+_MOST = 0.15
+# Of keyframes and landmarks this share may be found wrong; more, and it is the other map that is.
+_MAX_MOVED = 0.3
+# Distances of the same two keyframes that differ by so many of both sigmas contradict each other.
+_CONTRADICTS = 5.0
+# So few landmarks in common tell nothing.
+_FEWEST = 20
+
+
+def contradiction(old: LandmarkMap, sure: MapUncertainty, new: LandmarkMap) -> str:
+    """Say how a map contradicts the one in use; empty if it does not.
+
+    Args:
+        old: the map in use.
+        sure: how well that is known.
+        new: a map that is to take its place: a revision of it, of one before or after it, or
+            any other.
+
+    Returns:
+        The reason. Maps without a keyframe in common do not contradict each other, unless one
+        says that it was made from the other, which is not known here.
+    """
+    places = _in_common(old, new)
+    if not places:
+        return ""
+    reach_m = _MOST * _scene_m(old)
+    return (
+        _moved_keyframes(old, sure, new, places, reach_m)
+        or _moved_distances(old, new, places)
+        or _moved_landmarks(old, sure, new, places, reach_m)
+    )
+
+
+def have_common_keyframes(old: LandmarkMap, new: LandmarkMap) -> bool:
+    """Whether two maps have a keyframe in common: of the same drone and instant."""
+    return bool(_in_common(old, new))
+
+
+def _in_common(old: LandmarkMap, new: LandmarkMap) -> list[tuple[int, int]]:
+    """Return the places, in the old and in the new map, of the keyframes of both."""
+    where = {(k.drone_id, k.captured_at_ns): i for i, k in enumerate(old.keyframes)}
+    names = [(k.drone_id, k.captured_at_ns) for k in new.keyframes]
+    return [(where[name], i) for i, name in enumerate(names) if name in where]
+
+
+def _scene_m(landmark_map: LandmarkMap) -> float:
+    """Return how far the landmarks are from the keyframes that see them, m."""
+    seen = landmark_map.seen
+    bodies = np.array([k.world_from_body.translation for k in landmark_map.keyframes])
+    away = np.linalg.norm(landmark_map.points_world[:, None] - bodies, axis=2)[seen]
+    return float(np.median(away)) if len(away) else 0.0
+
+
+def _moved_keyframes(
+    old: LandmarkMap,
+    sure: MapUncertainty,
+    new: LandmarkMap,
+    places: list[tuple[int, int]],
+    reach_m: float,
+) -> str:
+    floor = np.diag([_LEAST_M**2] * 3 + [_LEAST_RAD**2] * 3)
+    moved_m = []
+    for before, after in places:
+        own = slice(6 * before, 6 * before + 6)
+        step = old.keyframes[before].world_from_body.local(new.keyframes[after].world_from_body)
+        covariance = sure.keyframe_covariance[own, own] + floor
+        squared = float(step @ np.linalg.solve(covariance, step))
+        metres = float(np.linalg.norm(step[:3]))
+        if squared > _CHI2_6 or metres > max(reach_m, _LEAST_M):
+            moved_m.append(metres)
+    if len(moved_m) <= _MAX_MOVED * len(places):
+        return ""
+    return f"{len(moved_m)} of {len(places)} known keyframes moved by {np.median(moved_m):.2f} m"
+
+
+def _moved_distances(old: LandmarkMap, new: LandmarkMap, places: list[tuple[int, int]]) -> str:
+    after = dict(places)
+    known = {
+        frozenset((after[d.keyframe_a], after[d.keyframe_b])): d
+        for d in old.distances
+        if d.keyframe_a in after and d.keyframe_b in after
+    }
+    for d in new.distances:
+        before = known.get(frozenset((d.keyframe_a, d.keyframe_b)))
+        if before is None:
+            continue
+        off_m = abs(d.distance_m - before.distance_m)
+        # Its own sigma is what the other one says: no more than ours is believed.
+        if off_m > _CONTRADICTS * before.sigma_m + _LEAST_M:
+            return f"a distance of {before.distance_m:.2f} m is {d.distance_m:.2f} m there"
+    return ""
+
+
+def _moved_landmarks(
+    old: LandmarkMap,
+    sure: MapUncertainty,
+    new: LandmarkMap,
+    places: list[tuple[int, int]],
+    reach_m: float,
+) -> str:
+    """Compare the landmarks that were seen at the same pixel of the same keyframe."""
+    then, now = _same_landmarks(old, new, places)
+    if len(then) < _FEWEST:
+        return ""
+    moved = new.points_world[now] - old.points_world[then]
+    covariance = sure.marginal()[then] + _LEAST_M**2 * np.eye(3)
+    squared = np.einsum("ni,ni->n", moved, np.linalg.solve(covariance, moved[..., None])[..., 0])
+    metres = np.linalg.norm(moved, axis=1)
+    # A landmark far behind the scene is known as badly as it is far.
+    reaches_m = max(reach_m, _LEAST_M) + np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    far = (squared > _CHI2_3) | (metres > reaches_m)
+    if far.mean() <= _MAX_MOVED:
+        return ""
+    return f"{far.sum()} of {len(far)} known landmarks moved by {np.median(metres[far]):.2f} m"
+
+
+def _same_landmarks(
+    old: LandmarkMap, new: LandmarkMap, places: list[tuple[int, int]]
+) -> tuple[Array, Array]:
+    """Return which landmarks of both are the same: seen where the other was, in one keyframe."""
+    pairs: dict[int, int] = {}
+    for before, after in places:
+        there = np.flatnonzero(old.seen[:, before])
+        at = {
+            px.tobytes(): int(j)
+            for j, px in zip(there, old.observed_px[there, before], strict=True)
+        }
+        for j in np.flatnonzero(new.seen[:, after]):
+            known = at.get(new.observed_px[j, after].tobytes())
+            if known is not None:
+                pairs.setdefault(known, int(j))
+    return np.fromiter(pairs.keys(), np.intp), np.fromiter(pairs.values(), np.intp)
