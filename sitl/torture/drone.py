@@ -8,6 +8,7 @@ and what the link would send to it is counted as not sent and overheard.
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -36,6 +37,7 @@ from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.pose_requests import InterMavOptions
+from vcl_companion.swarm.quarantine import QuarantineOptions
 from vcl_companion.swarm.transfer import (
     BlobReceived,
     Event,
@@ -196,7 +198,11 @@ class TorturedDrone:
             role.own, Group(swarm, role.own), self.transfers, self._maps,
             AutopilotLink(AutopilotOptions("udp:127.0.0.1:9"), role.own, clock), SENSOR, clock,
             self._log, self._work, self._disk, self.estimator,
-            ExchangeOptions(swarm, building, UpdateOptions(), _DETECTORS, inter, tracked=True),
+            ExchangeOptions(
+                swarm, building, UpdateOptions(), _DETECTORS, inter, tracked=True,
+                # Who is tortured hears its tormentors to the end.
+                quarantine=QuarantineOptions(threshold=math.inf),
+            ),
             rng,
         )  # fmt: skip
         self.link = OpenLink(role.own, self.exchange, role.members, clock, heard)

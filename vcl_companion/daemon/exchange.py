@@ -12,7 +12,7 @@ import logging
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -42,7 +42,7 @@ from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.group import Group, PeerJoined, PeerLost, SwarmOptions
 from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
-from vcl_companion.swarm.quarantine import Evidence
+from vcl_companion.swarm.quarantine import Evidence, QuarantineOptions
 from vcl_companion.swarm.transfer import (
     BlobDelivered,
     BlobKind,
@@ -81,6 +81,7 @@ class ExchangeOptions:
     inter: InterMavOptions
     tracked: bool
     clock_resolution_ns: int = 0
+    quarantine: QuarantineOptions = field(default_factory=QuarantineOptions)
 
 
 class Exchange:
@@ -128,7 +129,7 @@ class Exchange:
         self._options = options
         self._link: PeerLink | None = None
         self._refusals = Refusals(log)
-        self.trust = PeerTrust(group, autopilot, log, self._turn_away)
+        self.trust = PeerTrust(group, autopilot, log, self._turn_away, options.quarantine)
         self._n_resets = 0
         self.clocks = PeerClocks(
             group, self._ask_time, clock, log, self._refusals.count, options.clock_resolution_ns

@@ -40,13 +40,13 @@ class PeerTrust:
         autopilot: AutopilotLink,
         log: FlightLog,
         turned_away: Callable[[int], None],
-        options: QuarantineOptions | None = None,
+        options: QuarantineOptions,
     ) -> None:
         self._group = group
         self._autopilot = autopilot
         self._log = log
         self._turned_away = turned_away
-        self._quarantine = Quarantine(options or QuarantineOptions())
+        self._quarantine = Quarantine(options)
         self._unsaid: dict[int, tuple[Severity, str]] = {}
         self._said_at_s = float("-inf")
 
