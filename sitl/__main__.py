@@ -407,6 +407,40 @@ def torture(
         click.get_current_context().exit(1)
 
 
+@main.command()
+@click.option(
+    "--drones",
+    default="2,5,10,30,100",
+    show_default=True,
+    metavar="N,N,...",
+    help="How many, in one run after the other.",
+)
+@click.option(
+    "--loss",
+    default=0.1,
+    show_default=True,
+    metavar="P",
+    help="Share of the datagrams that each receiver loses.",
+)
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
+@click.option("--out", default=Path("out/scale"), show_default=True, metavar="DIR", type=_FOLDER)
+def scale(drones: str, loss: float, seed: int, out: Path) -> None:
+    """Measure how a drone's bytes and processor time grow with the number of drones.
+
+    All drones live in one process over one lossy channel, by counted time: at rest, and while
+    a first map and its update are handed out. Minutes for 100. Leaves scale.md, scale.json and
+    scale.svg in the output folder. Exit status: 0, 2 for input that cannot be used.
+    """
+    # One thread for everybody: this counts before numpy is loaded.
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    from rich.console import Console
+
+    from sitl.scale.command import ScaleOptions, parse_drones, run_scale
+
+    run_scale(out, ScaleOptions(parse_drones(drones), loss, seed), Console())
+
+
 @main.group(name="import")
 def import_() -> None:
     """Turn recordings of other makers into ours."""

@@ -10,32 +10,25 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
-from sitl.torture.scene import SENSOR, Scene
+from sitl.drone_parts import DETECTORS, DroneParts
 from sitl.torture.valid import Overheard
+from sitl.wall import Scene
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import ManualClock
-from vcl_companion.daemon.estimator import Estimator
-from vcl_companion.daemon.exchange import Exchange, ExchangeOptions
-from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.exchange import Exchange
 from vcl_companion.daemon.inter_target import Asked
-from vcl_companion.daemon.map_store import MapStore, StoredMap
-from vcl_companion.daemon.map_work import MapWork
-from vcl_companion.daemon.workshop import WorkOptions, Workshop
+from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.links.autopilot import AutopilotLink, AutopilotOptions
 from vcl_companion.links.mavlink import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions, open_signing
-from vcl_companion.localization.intra import LocalizationOptions, Localized
-from vcl_companion.localization.pipeline import PipelineOptions
-from vcl_companion.localization.pose_filter import FilterOptions, FilterState
-from vcl_companion.localization.tracking import TrackingOptions
+from vcl_companion.localization.intra import Localized
+from vcl_companion.localization.pose_filter import FilterState
 from vcl_companion.mapping.options import MapOptions
-from vcl_companion.swarm.group import Group, SwarmOptions
+from vcl_companion.swarm.group import SwarmOptions
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.swarm.quarantine import QuarantineOptions
 from vcl_companion.swarm.transfer import (
@@ -46,8 +39,6 @@ from vcl_companion.swarm.transfer import (
     TransferOptions,
     Transfers,
 )
-from vcl_companion.swarm.updates import UpdateOptions
-from vcl_companion.vision.features import Detector, FeatureOptions
 from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.header import PayloadKind
 from vcl_companion.wire.messages import FrameRequest
@@ -56,7 +47,6 @@ from vcl_companion.wire.tunnel import decode_payload
 MIB = 1 << 20
 # A daemon's own limits hold thirty times what is sent here; these are reached.
 TRANSFER = TransferOptions(max_blob_bytes=MIB, memory_quota_bytes=4 * MIB)
-_DETECTORS: tuple[Detector, ...] = ("akaze",)
 _FIX_SIGMA = 0.01
 
 
@@ -180,31 +170,17 @@ class TorturedDrone:
         self.done: Counter[str] = Counter()
         self._heard = heard
         self._clock = clock
-        self._log = FlightLog("", clock)
-        self._maps = MapStore("")
-        self.estimator = Estimator(FilterOptions(), LocalizationOptions(), lambda why: None)
         first, second = role.members[:2]
         swarm = SwarmOptions(role.members, role.leader, ((first, second, 1.0),))
         inter = InterMavOptions(detector="akaze", least_interval_s=0.0)
-        building = MapOptions(detectors=_DETECTORS, member_wait_s=1.0, gather_timeout_s=10.0)
-        pipeline = PipelineOptions(FeatureOptions(), LocalizationOptions(), TrackingOptions())
-        work = WorkOptions(
-            swarm.known_distances, building, pipeline, _DETECTORS, inter, tracked=True
-        )
-        self._work = MapWork(Workshop(SENSOR, work), forks=False)
-        self._disk = ThreadPoolExecutor(1)  # begins no thread: see ``CountedLoop``
+        building = MapOptions(detectors=DETECTORS, member_wait_s=1.0, gather_timeout_s=10.0)
         self.transfers = WatchedTransfers(rng)
-        self.exchange = Exchange(
-            role.own, Group(swarm, role.own), self.transfers, self._maps,
-            AutopilotLink(AutopilotOptions("udp:127.0.0.1:9"), role.own, clock), SENSOR, clock,
-            self._log, self._work, self._disk, self.estimator,
-            ExchangeOptions(
-                swarm, building, UpdateOptions(), _DETECTORS, inter, tracked=True,
-                # Who is tortured hears its tormentors to the end.
-                quarantine=QuarantineOptions(threshold=math.inf),
-            ),
-            rng,
+        self._parts = DroneParts(
+            role.own, swarm, self.transfers, building, inter, clock, rng,
+            # Who is tortured hears its tormentors to the end.
+            QuarantineOptions(threshold=math.inf),
         )  # fmt: skip
+        self.estimator, self.exchange = self._parts.estimator, self._parts.exchange
         self.link = OpenLink(role.own, self.exchange, role.members, clock, heard)
         self.exchange.attach(self.link)
         self._tasks = [asyncio.ensure_future(self.exchange.run())]
@@ -213,7 +189,7 @@ class TorturedDrone:
     @property
     def stored(self) -> StoredMap | None:
         """The map that it flies on."""
-        return self._maps.current
+        return self._parts.maps.current
 
     def failures(self) -> list[BaseException]:
         """Return what its tasks have ended with that must not end, and forget those that did."""
@@ -265,8 +241,7 @@ class TorturedDrone:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        self._work.end()
-        self._disk.shutdown()
+        self._parts.end()
 
 
 def _fix(pose: Pose) -> Localized:

@@ -25,10 +25,10 @@ from typing import TextIO
 import numpy as np
 
 import vcl_companion
+from sitl.counted_loop import CountedLoop
 from sitl.torture.dice import Dice
 from sitl.torture.drone import TRANSFER, Role, TorturedDrone
 from sitl.torture.judging import blob_outcome, payload_outcome
-from sitl.torture.loop import CountedLoop
 from sitl.torture.script import Script
 from sitl.torture.valid import Overheard
 from vcl_companion.clock import ManualClock

@@ -11,7 +11,7 @@ import numpy as np
 
 from sitl.torture.dice import Dice
 from sitl.torture.frames import Payload
-from sitl.torture.scene import CAMERA, SENSOR, Scene
+from sitl.wall import CAMERA, SENSOR, Scene
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose

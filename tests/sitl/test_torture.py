@@ -12,10 +12,10 @@ import pytest
 from click.testing import CliRunner
 
 from sitl.__main__ import main
+from sitl.counted_loop import CountedLoop
 from sitl.torture.command import torture, torture_once_more
 from sitl.torture.dice import Dice
 from sitl.torture.frames import COMPANION, frame, hostile, tunnel
-from sitl.torture.loop import CountedLoop
 from sitl.torture.mutations import mutated
 from sitl.torture.report import MOST_GROWTH_BYTES, TortureOptions, grown_bytes, is_good, report_of
 from sitl.torture.session import Failure, SessionResult

@@ -64,6 +64,8 @@ from vcl_companion.wire.tunnel import TunnelPayload, decode_payload, is_ours
 _log = logging.getLogger(__name__)
 
 _STATE_INTERVAL_S = 1.0
+# Who joins is told soon, and all who join meanwhile with it: a group starts at one time.
+_STATE_TO_NEW_S = 0.2
 _STEP_S = 0.1
 
 
@@ -163,7 +165,7 @@ class Exchange:
             maps,
             self._answers.describe,
             self._send,
-            self._decide,
+            self.decide,
             self._passed,
             lambda: transfers.is_receiving(BlobKind.MAP, self._now_s()),
             log,
@@ -216,6 +218,7 @@ class Exchange:
         )
         self._vote = OwnVote(options.update)
         self._wants_update = False
+        self._has_joined = False  # somebody, who has not been told our state since
         self._wake = asyncio.Event()
 
     @property
@@ -248,6 +251,26 @@ class Exchange:
         self._accept(tunnel.sender_system, message, to_all=tunnel.target_system == 0)
         self._wake.set()
 
+    async def decide(
+        self, built: LandmarkMap | NoMap, instead_of: StoredMap | None, request_id: int
+    ) -> None:
+        """Fly on a map that was built and hand it out, or tell everybody why there is none.
+
+        Args:
+            built: what became of a round.
+            instead_of: the map in use when it began; None for a first map.
+            request_id: the round's.
+        """
+        if isinstance(built, LandmarkMap):
+            refused = await self._sharing.adopt(built, instead_of)
+            if refused is None:
+                return
+            built = refused
+        refusal = MapRefused.because(request_id, built.reason)
+        for peer in self._group.peers:
+            self._send(refusal, peer)
+        self._no_map(built.reason)
+
     async def run(self) -> None:
         """Keep transfers, states and rounds going until cancelled; a failure in one ends all."""
         async with asyncio.TaskGroup() as parts:
@@ -265,8 +288,10 @@ class Exchange:
             now_s = self._now_s()
             self._note(self._group.poll(now_s))
             self._review()
-            if self._voted(now_s) or now_s - told_at_s >= _STATE_INTERVAL_S:
+            interval_s = _STATE_TO_NEW_S if self._has_joined else _STATE_INTERVAL_S
+            if self._voted(now_s) or now_s - told_at_s >= interval_s:
                 told_at_s = now_s
+                self._has_joined = False
                 self._tell_state()
             self._sharing.hand_out(now_s)
             self._poll_transfers()
@@ -371,20 +396,6 @@ class Exchange:
         self._sharing.forgot(peer)
         self._passed.forgot(peer)
 
-    async def _decide(
-        self, built: LandmarkMap | NoMap, instead_of: StoredMap | None, request_id: int
-    ) -> None:
-        """Fly on the map that we have built, or tell everybody why there is none."""
-        if isinstance(built, LandmarkMap):
-            refused = await self._sharing.adopt(built, instead_of)
-            if refused is None:
-                return
-            built = refused
-        refusal = MapRefused.because(request_id, built.reason)
-        for peer in self._group.peers:
-            self._send(refusal, peer)
-        self._no_map(built.reason)
-
     def _no_map(self, reason: str) -> None:
         """Note that a round gave no map; the one in use stays, if there is one."""
         if self._maps.current is not None:
@@ -452,7 +463,7 @@ class Exchange:
             if joined:
                 self._forgot(event.peer)
                 self.clocks.joined(event.peer)
-                self._tell_state()
+                self._has_joined = True
             else:
                 self._passed.forgot(event.peer)
                 self.inter.lost(event.peer)

@@ -119,6 +119,7 @@ class MapSharing:
         self._handed: dict[int, _Handed] = {}
         self._update: _Update | None = None
         self._ahead: HandOut | None = None  # ours is not ready yet, peers may have it
+        self._given = (0, b"", float("-inf"))  # by whom, which map, when
         self._behind_since_s: float | None = None  # the coordinator, as far as known
 
     def offer(self, peer: int, kind: BlobKind, blob: bytes) -> None:
@@ -169,6 +170,7 @@ class MapSharing:
                     self._reject(peer, offer, "map that contradicts ours", ready.contradicts)
                     continue
                 if why_not is None:
+                    self._given = peer, offer.revision, asyncio.get_running_loop().time()
                     await self._install(ready)
                     continue
             self._reject(peer, offer, why_not)
@@ -270,13 +272,21 @@ class MapSharing:
     def _lacking(self, revision: bytes) -> list[int]:
         group = self._group
         if group.is_coordinator:
-            there = group.holders(revision)
-            return [peer for peer in group.peers if peer in group.alive and peer not in there]
+            there = {group.own_id, *group.holders(revision)}
+            return [peer for peer in group.alive if peer not in there]
         state = group.state_of(group.coordinator)
+        if self._was_given_lately(group.coordinator, revision):
+            return []
         if state is None or (state.revision and not self._has_been_behind(_FOLLOWS_S)):
             return []
         is_first_holder = group.holders(revision)[:1] == (group.own_id,)
         return [group.coordinator] if is_first_holder else []
+
+    def _was_given_lately(self, peer: int, revision: bytes) -> bool:
+        """Whether a peer has just handed us a map: it has it, though that has not been heard."""
+        giver, given, at_s = self._given
+        now_s = asyncio.get_running_loop().time()
+        return (giver, given) == (peer, revision) and now_s < at_s + _FOLLOWS_S
 
     def _coordinator_is_behind(self) -> bool:
         """Whether somebody else coordinates, and flies on a map that we have left."""

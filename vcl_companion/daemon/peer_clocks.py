@@ -20,6 +20,9 @@ _SLOW_S = 8.0
 # Question and answer are 43 bytes each when signed: of many peers fewer are asked at a time, so
 # that all of it stays below 90 B/s.
 _LEAST_BETWEEN_S = 1.0
+# Of many that have joined so many are asked at a time, of those that are asked rarely one: in a
+# large group everybody asking everybody at once would leave the air for nothing else.
+_MOST_QUICK_AT_ONCE = 2
 # Who has been asked so many without a relation that holds is asked rarely from then on.
 _MOST_QUICK = 8
 _LOG_EVERY_S = 5.0
@@ -27,7 +30,7 @@ _LONGEST_PAUSE_S = 0.5
 
 
 class PeerClocks:
-    """Asks every member alive for its time: quickly after it has joined, then rarely.
+    """Asks every member alive for its time: a few at a time quickly after they joined, then rarely.
 
     Args:
         group: whom to ask.
@@ -91,13 +94,24 @@ class PeerClocks:
         while True:
             # A clock that has not been told the time yet has nothing to compare.
             if self._clock.now_ns() > 0:
-                for peer in self._group.alive:
-                    if peer in self._times and self._is_due(peer):
-                        self._ask_for_time(peer)
+                for peer in self._whose_turn():
+                    self._ask_for_time(peer)
             self._wake.clear()
             with suppress(TimeoutError):
                 async with asyncio.timeout(_LONGEST_PAUSE_S):
                     await self._wake.wait()
+
+    def _whose_turn(self) -> list[int]:
+        """Return whom to ask now: who coordinates, which everybody deals with, then by age."""
+        due = [p for p in self._group.alive if p in self._times and self._is_due(p)]
+        coordinator = self._group.coordinator
+        due.sort(key=lambda p: (p != coordinator, self._asked_at_s.get(p, float("-inf"))))
+        rare = [peer for peer in due if self._is_rare(peer)]
+        quick = [peer for peer in due if not self._is_rare(peer)]
+        # Those who have been asked a moment ago count: everybody who joins makes a turn.
+        lately_s = self._now_s() - _LONGEST_PAUSE_S / 2
+        n_lately = sum(at_s > lately_s for at_s in self._asked_at_s.values())
+        return quick[: max(_MOST_QUICK_AT_ONCE - n_lately, 0)] + rare[: not n_lately]
 
     def _ask_for_time(self, peer: int) -> None:
         time = self._times[peer]
@@ -106,11 +120,14 @@ class PeerClocks:
         self._ask(time.ask(self._clock.now_ns()), peer)
 
     def _is_due(self, peer: int) -> bool:
-        is_rare = self._times[peer].is_settled or self._n_quick[peer] >= _MOST_QUICK
-        every_s = max(_SLOW_S, _LEAST_BETWEEN_S * len(self._times)) if is_rare else _QUICK_S
+        slow_s = max(_SLOW_S, _LEAST_BETWEEN_S * len(self._times))
+        every_s = slow_s if self._is_rare(peer) else _QUICK_S
         # A turn comes a little early or late: due is what the next one would be too late for.
         since_s = self._now_s() - self._asked_at_s.get(peer, float("-inf"))
         return since_s >= every_s - _LONGEST_PAUSE_S / 2
+
+    def _is_rare(self, peer: int) -> bool:
+        return self._times[peer].is_settled or self._n_quick[peer] >= _MOST_QUICK
 
     def _tell(self, peer: int, time: PeerTime) -> None:
         """Write what is known now, unless that was done a moment ago."""

@@ -138,7 +138,7 @@ class Group:
 
     def heartbeat(self, peer: int, now_s: float) -> list[GroupEvent]:
         """Note that a peer is heard; who is no member is ignored."""
-        if peer not in self.peers:
+        if peer == self.own_id or peer not in self.members:
             return []
         is_new = peer not in self._heard_at_s
         self._heard_at_s[peer] = max(now_s, self._heard_at_s.get(peer, now_s))

@@ -30,7 +30,7 @@ _WALL_M = 8.0
 _MOST_OFF_PX = 40
 _QUALITY = 30
 _MOST_LANDMARKS = 60
-_DEMO = Path(__file__).parents[1] / "recordings" / "demo"
+_DEMO = Path(__file__).parent / "recordings" / "demo"
 
 
 @functools.cache

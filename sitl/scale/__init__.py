@@ -1,0 +1,1 @@
+"""How what drones say to each other grows with their number: many in one process, counted."""
