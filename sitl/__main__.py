@@ -114,6 +114,11 @@ def main() -> None:
 @click.option("--rate", type=float, metavar="BIT/S", help="Of each drone's transmitter.")
 @click.option("--shared", is_flag=True, help="All drones together have that --rate.")
 @click.option(
+    "--addressed",
+    is_flag=True,
+    help="What is for several goes to each by itself; else all hear what one sends.",
+)
+@click.option(
     "--queue",
     default=0.5,
     show_default=True,
@@ -126,6 +131,20 @@ def main() -> None:
     multiple=True,
     metavar="10-40:mav0|mav1,mav2",
     help="Groups that do not hear each other, between two seconds of the recording (repeatable).",
+)
+@click.option(
+    "--late",
+    "late",
+    multiple=True,
+    metavar="mav2=8",
+    help="Start a drone's daemon only at that second of the recording (repeatable).",
+)
+@click.option(
+    "--kill",
+    "kills",
+    multiple=True,
+    metavar="mav0=12-20",
+    help="Kill a drone's daemon (SIGKILL) at a second, and start it again at another (repeatable).",
 )
 def fly(
     recording: Path,
@@ -147,8 +166,11 @@ def fly(
     corrupt: float,
     rate: float | None,
     shared: bool,
+    addressed: bool,
     queue: float,
     partitions: tuple[str, ...],
+    late: tuple[str, ...],
+    kills: tuple[str, ...],
 ) -> None:
     """Fly RECORDING (a folder; the embedded demo by default) and report how it went.
 
@@ -160,6 +182,7 @@ def fly(
     """
     from rich.console import Console
 
+    from sitl.absences import parse_kill, parse_late
     from sitl.fly import fly as fly_recording
     from sitl.network import NetworkOptions
     from sitl.partitions import parse_partition
@@ -187,9 +210,11 @@ def fly(
             corrupt=corrupt,
             rate_bits_per_s=rate,
             shared=shared,
+            addressed=addressed,
             queue_s=queue,
             partitions=tuple(map(parse_partition, partitions)),
         ),
+        absences=(*map(parse_late, late), *map(parse_kill, kills)),
     )
     embedded = str(recording) == "demo" and not recording.exists()
     console = Console()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -126,8 +126,12 @@ class FlightLog:
         return dict(Counter(reasons).most_common())
 
 
-def read_flight_log(path: Path) -> FlightLog:
+def read_flight_log(path: Path, *, cut_off: bool = False) -> FlightLog:
     """Read a daemon's log; kinds of lines not known here are passed over.
+
+    Args:
+        path: the file.
+        cut_off: whether its daemon was killed, which may have left half a line at its end.
 
     Raises:
         FlightError: a line is not what it should be; names file and row.
@@ -138,7 +142,7 @@ def read_flight_log(path: Path) -> FlightLog:
     maps: list[MapRow] = []
     clocks: list[ClockRow] = []
     summary: SummaryRow | None = None
-    for row, line in _json_lines(path):
+    for row, line in _json_lines(path, cut_off=cut_off):
         match line.get("kind"):
             case "frame":
                 frames.append(_converted(line, FrameRow, path, row))
@@ -156,6 +160,18 @@ def read_flight_log(path: Path) -> FlightLog:
     frames.sort(key=lambda frame: frame.sequence)
     return FlightLog(
         tuple(frames), tuple(estimates), tuple(events), tuple(maps), summary, tuple(clocks)
+    )
+
+
+def joined(logs: Sequence[FlightLog]) -> FlightLog:
+    """Return the logs of one daemon's runs as one; its summary is that of the last run."""
+    return FlightLog(
+        tuple(frame for log in logs for frame in log.frames),
+        tuple(estimate for log in logs for estimate in log.estimates),
+        tuple(event for log in logs for event in log.events),
+        tuple(row for log in logs for row in log.maps),
+        logs[-1].summary if logs else None,
+        tuple(clock for log in logs for clock in log.clocks),
     )
 
 
@@ -218,12 +234,14 @@ def read_received(path: Path, system_id: int) -> Estimates:
     )
 
 
-def _json_lines(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+def _json_lines(path: Path, *, cut_off: bool = False) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield (row, object) of a file of JSON lines; rows count from 1."""
     try:
         lines = path.read_text(encoding="utf-8").split("\n")
     except OSError as error:
         raise FlightError(f"{path}: {error.strerror}") from error
+    if cut_off:
+        del lines[-1]  # what follows the last line break
     for row, line in enumerate(lines, start=1):
         if not line.strip():
             continue

@@ -23,8 +23,8 @@ from sitl.result import Event, gather
 from sitl.swarm import Swarm
 from sitl.trajectory_files import write_trajectories
 from vcl_companion.daemon.scheduling import run_among_others, run_before_others
-from vcl_companion.mapping.warm_up import warm_up
 from vcl_companion.recording import read_recording
+from vcl_companion.wire.warm_up import warm_up
 
 _ANSWER_TIMEOUT_S = 60.0
 
@@ -86,7 +86,8 @@ async def _flown(plan: FlightPlan, out: Path, progress: Progress) -> Conduct:
             await unless_one_ends(swarm.children, _play(plan, swarm, conduct, progress))
             progress("ending the daemons", 0, 0)
             for drone in swarm.drones:
-                drone.camera.say_end(plan.ends_at_ns)
+                if drone.camera.is_connected:
+                    drone.camera.say_end(plan.ends_at_ns)
             await swarm.finish()
         finally:
             await swarm.end()
@@ -136,7 +137,9 @@ async def _play(plan: FlightPlan, swarm: Swarm, conduct: Conduct, progress: Prog
     flat_out = math.isinf(speed)
     frames_at_ns = [drone.frames_at_ns for drone in plan.drones]
     moments = instants(frames_at_ns, flat_out)
-    holds_after = gate(moments, len(plan.drones))
+    late = {absence.drone for absence in plan.options.absences if absence.from_s == 0.0}
+    there = {n for n, drone in enumerate(plan.drones) if drone.name not in late}
+    holds_after = gate(moments, there)
     n_frames = sum(map(len, frames_at_ns))
     n_given = 0
     begun_s = time.monotonic()
@@ -145,6 +148,7 @@ async def _play(plan: FlightPlan, swarm: Swarm, conduct: Conduct, progress: Prog
         if flat_out and moment.frames and k > holds_after:
             await _all_answered(swarm)
         await asyncio.sleep(max(0.0, pace.wait_s(moment.at_ns, time.monotonic())))
+        await swarm.kill_and_start(moment.at_ns)
         await _hand_out(moment, swarm)
         if k == 0:
             await swarm.clocks_related(moment.at_ns)
@@ -168,6 +172,8 @@ async def _hand_out(moment: Instant, swarm: Swarm) -> None:
     await swarm.advance_to(moment.at_ns)
     given = {due.drone: due for due in moment.frames}
     for n, drone in enumerate(swarm.drones):
+        if not drone.camera.is_connected:
+            continue  # nobody is there to see it
         if n in given:
             frame = drone.planned.drone.frames[given[n].sequence]
             drone.camera.give(given[n].sequence, moment.at_ns, frame.path.read_bytes())

@@ -29,13 +29,15 @@ class FrameServer:
     Attributes:
         drone: whose camera this is.
         outcomes: sequence to what the daemon said became of that frame.
-        n_given: frames handed out so far.
+        given: sequences of the frames handed out so far, but for those that a daemon had in
+            hand when it was killed.
     """
 
     def __init__(self, drone: str) -> None:
         self.drone = drone
         self.outcomes: dict[int, Outcome] = {}
-        self.n_given = 0
+        self.given: list[int] = []
+        self._open: set[int] = set()
         self._server: asyncio.Server | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._changed = asyncio.Condition()
@@ -49,8 +51,13 @@ class FrameServer:
 
     @property
     def is_connected(self) -> bool:
-        """Whether a daemon has ever connected."""
+        """Whether a daemon has connected, and was not killed since."""
         return self._writer is not None
+
+    @property
+    def n_given(self) -> int:
+        """How many frames were handed out so far."""
+        return len(self.given)
 
     async def connected(self) -> None:
         """Wait until the daemon has connected."""
@@ -64,7 +71,8 @@ class FrameServer:
             FlightError: the daemon hung up, or does not read what it is given.
         """
         self._send(StreamFrame(sequence, at_ns, image_bytes))
-        self.n_given += 1
+        self.given.append(sequence)
+        self._open.add(sequence)
 
     def tell_time(self, at_ns: int) -> None:
         """Move the daemon's clock on."""
@@ -81,15 +89,24 @@ class FrameServer:
             FlightError: the daemon hung up or broke the protocol before.
         """
         async with self._changed:
-            await self._changed.wait_for(
-                lambda: self._failure is not None or len(self.outcomes) >= self.n_given
-            )
-        if len(self.outcomes) < self.n_given:
+            await self._changed.wait_for(lambda: self._failure is not None or not self._open)
+        if self._open:
             raise FlightError(self._failure or "")
 
     def unanswered(self) -> list[int]:
         """Return the frames handed out that no answer has come for."""
-        return [n for n in range(self.n_given) if n not in self.outcomes]
+        return sorted(self._open)
+
+    async def was_killed(self) -> None:
+        """Read the last answers of a daemon that was killed; then another may connect.
+
+        What it has not answered, nobody will.
+        """
+        async with self._changed:
+            await self._changed.wait_for(lambda: self._writer is None or self._failure is not None)
+        self.given = [sequence for sequence in self.given if sequence not in self._open]
+        self._open.clear()
+        self._writer = self._failure = None
 
     async def close(self) -> None:
         """Hang up and stop listening."""
@@ -126,8 +143,9 @@ class FrameServer:
             writer.transport.abort()
 
     async def _take(self, sequence: int, outcome: Outcome) -> None:
-        if sequence >= self.n_given or sequence in self.outcomes:
+        if sequence not in self._open:
             raise WireError(f"answers frame {sequence}, which is not waiting for one")
         async with self._changed:
+            self._open.remove(sequence)
             self.outcomes[sequence] = outcome
             self._changed.notify_all()

@@ -52,6 +52,8 @@ class NetworkOptions:
         corrupt: share that arrives with other bytes.
         rate_bits_per_s: of each sender; None: no bound.
         shared: all senders together have that rate.
+        addressed: whether what is for several is sent to each of them by itself, as through an
+            access point; else all hear what one sends.
         queue_s: for how long a datagram may wait for its transmission.
         partitions: who cannot hear whom when.
     """
@@ -66,6 +68,7 @@ class NetworkOptions:
     corrupt: float = 0.0
     rate_bits_per_s: float | None = None
     shared: bool = False
+    addressed: bool = False
     queue_s: float = 0.5
     partitions: tuple[Partition, ...] = ()
 

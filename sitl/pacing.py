@@ -6,7 +6,7 @@ No clock and no sleeping in here: ``Pace`` is told both times.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,16 +62,20 @@ def instants(frames_at_ns: Sequence[NDArray[np.int64]], flat_out: bool) -> list[
     return [Instant(at_ns, tuple(due[at_ns])) for at_ns in sorted(due)]
 
 
-def gate(moments: Sequence[Instant], n_drones: int) -> int:
+def gate(moments: Sequence[Instant], drones: Collection[int]) -> int:
     """Return the index of the moment after which the recording waits for the first map.
 
     Every drone has been given its first frame by then, and, unless a second one
     is due before, the attitude sample after it.
+
+    Args:
+        moments: of the recording.
+        drones: those that are there from the start.
     """
     given: set[int] = set()
     for k, moment in enumerate(moments):
         given.update(due.drone for due in moment.frames)
-        if len(given) == n_drones:
+        if given.issuperset(drones):
             followed = k + 1 < len(moments) and not moments[k + 1].frames
             return k + 1 if followed else k
     raise ValueError("a drone has no frame")

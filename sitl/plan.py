@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sitl.absences import Absence, check_absences
 from sitl.network import NetworkOptions
 from sitl.partitions import check_flying
 from vcl_companion.config import Config
@@ -48,6 +49,7 @@ class FlyOptions:
         settings: more of the daemons' configuration.
         seed: of the noise of the attitude, and of the network.
         network: how bad the radio between the drones is.
+        absences: when whose daemon does not run.
     """
 
     speed: float = 1.0
@@ -58,6 +60,7 @@ class FlyOptions:
     settings: tuple[Setting, ...] = ()
     seed: int = 0
     network: NetworkOptions = field(default_factory=NetworkOptions)
+    absences: tuple[Absence, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.speed > 0.0:
@@ -189,13 +192,15 @@ def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:
         if drone.name in flying
     )
     check_flying(options.network.partitions, flying)
-    return FlightPlan(
+    plan = FlightPlan(
         recording=recording,
         drones=drones,
         leader=recording.leader if recording.leader in flying else flying[0],
         known_distances=_known_distances(recording, drones, options.known_distances),
         options=options,
     )
+    check_absences(options.absences, flying, (plan.ends_at_ns - plan.starts_at_ns) * 1e-9)
+    return plan
 
 
 def _attitude_path(drone: Drone, earlier: Path | None) -> Path | None:

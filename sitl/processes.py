@@ -21,6 +21,7 @@ _TAIL_BYTES = 16384
 _KILL_WAIT_S = 5.0
 # A broken pipe or socket is seen before the exit of the process behind it; look twice.
 _BLAME_WAIT_S = 2.0
+_LOOK_S = 0.05
 
 
 class FlightError(VclError):
@@ -108,25 +109,37 @@ async def start_child(
 async def unless_one_ends(children: Sequence[Child], work: Coroutine[Any, Any, Result]) -> Result:
     """Do the work; give it up as soon as any of the children ends.
 
+    Args:
+        children: who is looked at again and again, so that a live list may change.
+        work: what is done.
+
     Raises:
         FlightError: a child ended: which, how, and its last line. Also in place
             of an error of the work itself when a child's end explains it.
     """
     doing = asyncio.ensure_future(work)
-    ends = [asyncio.ensure_future(child.process.wait()) for child in children]
     try:
-        await asyncio.wait([doing, *ends], return_when=asyncio.FIRST_COMPLETED)
+        while not doing.done() and all(child.running for child in children):
+            await asyncio.wait([doing], timeout=_LOOK_S)
         if doing.done() and doing.exception() is not None:
-            await asyncio.wait(ends, timeout=_BLAME_WAIT_S, return_when=asyncio.FIRST_COMPLETED)
+            with suppress(TimeoutError):
+                async with asyncio.timeout(_BLAME_WAIT_S):
+                    while all(child.running for child in children):
+                        await asyncio.sleep(_LOOK_S)
         for child in children:
             if not child.running:
                 raise FlightError(child.obituary())
         return await doing
     finally:
         doing.cancel()
-        for end in ends:
-            end.cancel()
-        await asyncio.gather(doing, *ends, return_exceptions=True)
+        await asyncio.gather(doing, return_exceptions=True)
+
+
+async def kill_child(child: Child) -> None:
+    """Kill a child with all that it has started, as systemd would, and wait until it is gone."""
+    with suppress(ProcessLookupError):
+        os.killpg(child.process.pid, signal.SIGKILL)
+    await child.process.wait()
 
 
 async def end_children(children: Iterable[Child], timeout_s: float) -> list[Child]:

@@ -1,8 +1,9 @@
 """The air between the daemons of a flight: their peer datagrams pass through sockets of ours.
 
-Each ordered pair of drones has a socket here. What drone a sends to the socket a → b
-becomes a datagram to b, sent from the socket b → a, which is where b sends what is for
-a: to the daemons these are the other drones' addresses, as they would be in the air.
+Each drone has a socket here, its *air*: what it sends there everybody else hears, as on a
+radio or by multicast, and what it hears comes from there. Or, *addressed*, as through an
+access point, each ordered pair has one: what drone a sends to the socket a → b becomes a
+datagram to b, sent from the socket b → a, which is where b sends what is for a.
 What happens in between is ``sitl.network``'s; its seconds are the wall clock's, those of
 the partitions the flight's.
 
@@ -29,6 +30,8 @@ _MAX_UNDER_WAY_BYTES = 64 << 20
 
 _Pair = tuple[str, str]
 
+_AIR = ""  # in the place of a receiver: all others
+
 
 class Relay:
     """Sockets between daemons; ``close`` must be called whatever happens.
@@ -36,6 +39,7 @@ class Relay:
     Args:
         names: the drones.
         network: what becomes of the datagrams.
+        addressed: whether drones send to each other one by one.
         max_under_way_bytes: more is dropped.
 
     Attributes:
@@ -50,9 +54,13 @@ class Relay:
         self,
         names: Sequence[str],
         network: Network,
+        *,
+        addressed: bool = False,
         max_under_way_bytes: int = _MAX_UNDER_WAY_BYTES,
     ) -> None:
         self.network = network
+        self._names = tuple(names)
+        self._addressed = addressed
         self.traffic = PeerTraffic()
         self.n_dropped = 0
         self.n_strangers = 0
@@ -68,15 +76,14 @@ class Relay:
         self._loop = asyncio.get_running_loop()
         try:
             for sender in names:
-                for receiver in names:
-                    if sender != receiver:
-                        self._sockets[sender, receiver] = _opened()
+                for receiver in self._others(sender) if addressed else (_AIR,):
+                    self._sockets[sender, receiver] = _opened()
         except OSError:
             self.close()
             raise
 
     def ports(self, sender: str) -> list[int]:
-        """Return the ports of 127.0.0.1 that a drone sends to, one for each of the others."""
+        """Return the ports of 127.0.0.1 that a drone sends to: one, or one for each other."""
         return [
             int(opened.getsockname()[1])
             for pair, opened in self._sockets.items()
@@ -103,6 +110,9 @@ class Relay:
         self._sockets = {}
         self._under_way = []
 
+    def _others(self, name: str) -> tuple[str, ...]:
+        return tuple(other for other in self._names if other != name)
+
     def _receive(self, pair: _Pair, opened: socket.socket) -> None:
         sender, receiver = pair
         now_s = self._loop.time()
@@ -115,8 +125,11 @@ class Relay:
                 self.n_strangers += 1
                 continue
             self.traffic.count(sender, data)
-            for due_s, arriving in self.network.send(now_s, sender, receiver, data, self.flight_s):
-                self._take(due_s, pair, arriving)
+            hearers = self._others(sender) if receiver == _AIR else (receiver,)
+            for hearer, (due_s, arriving) in self.network.broadcast(
+                now_s, sender, hearers, data, self.flight_s
+            ):
+                self._take(due_s, (sender, hearer), arriving)
         self._deliver()
 
     def _take(self, due_s: float, pair: _Pair, data: bytes) -> None:
@@ -133,8 +146,9 @@ class Relay:
         while self._under_way and self._under_way[0][0] <= now_s:
             _, _, (sender, receiver), data = heapq.heappop(self._under_way)
             self._under_way_bytes -= len(data)
+            heard_from = self._sockets[receiver, sender if self._addressed else _AIR]
             try:
-                self._sockets[receiver, sender].sendto(data, ("127.0.0.1", self._daemons[receiver]))
+                heard_from.sendto(data, ("127.0.0.1", self._daemons[receiver]))
             except OSError:
                 self.n_dropped += 1
         self._come_back()

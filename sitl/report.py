@@ -17,6 +17,14 @@ Terms beyond ``sitl.evaluation``'s:
 * ``relies_on``: share of the frames whose sent pose relies on the map by ``patches`` or by
   ``features``, on a ``peer`` alone, on attitude and ``motion`` alone, or where ``nothing``
   was sent.
+* ``lives``: each run of its daemon, in seconds of the recording: when its process was
+  ``started_s``, when it was ``ready_s`` (it had connected to its camera, and begins to speak to
+  autopilot and peers; starting an interpreter and compiling is before), and when it was
+  ``killed_s``. ``seconds_to_map``, ``seconds_to_newest_map`` and ``seconds_to_localized``: from
+  there, in seconds of the wall clock, to its first map, to one that another was on as well,
+  and to the first pose that it sent; null for who is there from the start, when the recording
+  waits for the map. Who was killed is judged by the frames that its daemon was given while it
+  lived, and answered; ``peer_bytes_sent`` and the load are the last run's.
 * ``peer_bytes_per_s``: sent to the other drones, per second of recording time.
 * ``peer_link``: the same by message, and what became of it (``sitl.network_report``).
 * ``map``: the leader's last revision; ``revisions`` counts all of them.
@@ -32,6 +40,7 @@ from typing import Any
 
 import numpy as np
 
+from sitl.lives_report import lives_of
 from sitl.network_report import options_of, peer_link_of
 from sitl.plan import pipeline_of
 from sitl.reliance import shares
@@ -86,11 +95,13 @@ def report_of(result: FlightResult) -> dict[str, Any]:
             "seed": options.seed,
             "network": options_of(options.network),
             "start_timeout_s": options.start_timeout_s,
+            "absences": [str(absence) for absence in options.absences],
             "settings": {".".join(setting.path): setting.value for setting in options.settings},
         },
         "drones": {
             drone.name: {
                 **_drone(drone, duration_s),
+                "lives": lives_of(result, drone),
                 "peer_link": peer_link_of(result.network, drone.name, duration_s),
             }
             for drone in result.drones
@@ -124,7 +135,7 @@ def _drone(drone: DroneResult, duration_s: float) -> dict[str, Any]:
     sent = summary.peer_bytes_sent if summary else None
     return {
         "frames": drone.n_frames,
-        "localized_share": drone.n_localized / drone.n_frames,
+        "localized_share": drone.n_localized / max(drone.n_frames, 1),
         "frames_localized": log.count("localized"),
         "frames_refused": log.count("refused"),
         "frames_dropped": log.count("dropped"),

@@ -7,6 +7,7 @@ from html import escape
 from typing import Any
 
 from sitl import report_plots
+from sitl.lives_report import lives_html
 from sitl.network_report import network_html, network_text
 from sitl.page_style import document, section
 from sitl.plotting import colour
@@ -41,7 +42,7 @@ def page(result: FlightResult, report: Mapping[str, Any]) -> str:
     """Return the whole page of a flight; ``report`` is what ``report.json`` says."""
     name = escape(str(report["recording"]))
     errors = report_plots.errors_svg(result)
-    network = network_html(report)
+    network, lives = network_html(report), lives_html(report)
     parts = [
         _alarms(report),
         section("Where they flew", _flight_note(result), report_plots.trajectories_svg(result)),
@@ -49,6 +50,7 @@ def page(result: FlightResult, report: Mapping[str, Any]) -> str:
         section("What the poses rely on", _RELIANCE_NOTE,
                  strips_svg(result) + _reliance_table(report)),
         section("Whence the poses", _SOURCE_NOTE, _source_table(report)),
+        section("Lives of the daemons", _LIVES_NOTE, lives) if lives else "",
         section("Error along every axis", _ERROR_NOTE, errors) if errors else "",
         section("Tracked landmarks", "", report_plots.landmarks_svg(result)),
         section("Latency and load", _LATENCY_NOTE,
@@ -87,6 +89,12 @@ _LATENCY_NOTE = (
     "first frame waits for the first map and is told apart."
 )
 
+_LIVES_NOTE = (
+    "Seconds of the recording at which a daemon was started, was ready (had connected to its "
+    "camera) and was killed. From ready, in seconds of the wall clock: to its first map, to one "
+    "that another flew on as well, and to the first pose that its autopilot got. Frames count "
+    "for a drone while its daemon lived."
+)
 _NETWORK_NOTE = (
     "What each drone sent to the others, once for each of them: the payload of TUNNEL, the whole "
     "MAVLink frames, and the frames by drone in kB, from the start of the daemons to their end; "
@@ -254,6 +262,7 @@ def _options(report: Mapping[str, Any]) -> str:
         ("network", network_text(options["network"])),
         ("pipeline", report["pipeline"]),
         ("settings", settings or "defaults"),
+        ("absences", ", ".join(options["absences"]) or "none"),
         ("map revisions", f"{swarm_map['revisions']} ({swarm_map['keyframes']} keyframes)"),
     ]
     if wall:

@@ -17,13 +17,8 @@ from sitl.evaluation import (
     ref_from_world,
     scores,
 )
-from sitl.flight_log import (
-    FlightLog,
-    MapRow,
-    estimates_of,
-    read_flight_log,
-    read_received,
-)
+from sitl.flight_log import FlightLog, MapRow, estimates_of, read_received
+from sitl.lives import Life, Lives, read_lives, read_log
 from sitl.network_log import NetworkLog, read_network_log
 from sitl.plan import FlightPlan, PlannedDrone
 from sitl.processes import FlightError
@@ -63,6 +58,8 @@ class DroneResult:
         scores: those errors in numbers.
         alone: the same of what was fused: ``intra``, the frames' own fixes, and
             ``inter``, the peers' proposals, each as it came; only those there were.
+        given: (G,) which frames a living daemon was given.
+        lives: of its daemon, in order.
     """
 
     name: str
@@ -74,11 +71,13 @@ class DroneResult:
     errors: PoseErrors | None
     scores: Scores | None
     alone: Mapping[str, Scores]
+    given: NDArray[np.int64]
+    lives: tuple[Life, ...]
 
     @property
     def n_frames(self) -> int:
-        """Frames of the recording."""
-        return len(self.frames_at_ns)
+        """Frames of the recording that a living daemon was given."""
+        return len(self.given)
 
     @property
     def n_localized(self) -> int:
@@ -103,7 +102,7 @@ class DroneResult:
         """Frames that the daemon's log says nothing about, or more than one thing."""
         rows = [frame.sequence for frame in self.log.frames]
         twice = len(rows) - len(set(rows))
-        return len(set(range(self.n_frames)) ^ set(rows)) + twice
+        return len(set(self.given.tolist()) ^ set(rows)) + twice
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +114,8 @@ class FlightResult:
         drones: in the plan's order.
         ref_from_world: carries ``world`` into the recording's NED; None when the
             leader has no estimate with a truth.
-        maps: the leader's map revisions in the order they came into use.
+        maps: the leader's map revisions in the order they came into use; another drone's when
+            the leader had none, or was not there at the end.
         points_ref_m: (N, 3) landmarks of the last map, where ``ref_from_world``
             puts them, else in ``world``.
         events: of all drones and the harness, in time order.
@@ -142,20 +142,25 @@ def gather(plan: FlightPlan, out: Path, events: Iterable[Event] = ()) -> FlightR
     Raises:
         FlightError: a file is missing or broken; names it.
     """
-    logs = {d.name: read_flight_log(out / "run" / d.name / "flight.jsonl") for d in plan.drones}
+    lives = read_lives(out)
+    logs = {d.name: read_log(out / "run" / d.name, lives.get(d.name)) for d in plan.drones}
     truths = {d.name: _truth_at_frames(d) for d in plan.drones}
     heard = {
-        d.name: _on_frames(d, read_received(out / d.name / "received.jsonl", d.system_id))
+        d.name: _of_given(
+            lives.get(d.name),
+            *_on_frames(d, read_received(out / d.name / "received.jsonl", d.system_id)),
+        )
         for d in plan.drones
     }
     network = read_network_log(out)
     alignment = _alignment(*heard[plan.leader], truths[plan.leader])
     drones = tuple(
-        _drone_result(d, truths[d.name], *heard[d.name], logs[d.name], alignment)
+        _drone_result(d, truths[d.name], *heard[d.name], logs[d.name], alignment, lives.get(d.name))
         for d in plan.drones
     )
-    maps = logs[plan.leader].maps or next((log.maps for log in logs.values() if log.maps), ())
-    points = _map_points(out / "run" / plan.leader / "maps", maps)
+    mapped_by = _whose_maps(plan, logs, lives)
+    maps = logs[mapped_by].maps
+    points = _map_points(out / "run" / mapped_by / "maps", maps)
     said = [*events, *_logged(plan, logs), *(e for d in drones for e in _doubts(d))]
     if network is not None:
         said += _network_doubts(network)
@@ -180,8 +185,10 @@ def _drone_result(
     frame_of: NDArray[np.int64],
     log: FlightLog,
     alignment: Pose | None,
+    lives: Lives | None,
 ) -> DroneResult:
     errors = None
+    every = range(len(planned.drone.frames))
     if alignment is not None:
         true = tuple(truth[n] if n >= 0 else None for n in frame_of.tolist())
         errors = pose_errors(estimates, true, alignment)
@@ -196,6 +203,8 @@ def _drone_result(
         errors=errors if errors is not None and len(errors.at_ns) else None,
         scores=scores(errors, axes) if errors is not None else None,
         alone={} if alignment is None else _alone(planned, truth, log, alignment, axes),
+        given=np.array(every if lives is None else lives.frames, dtype=np.int64),
+        lives=() if lives is None else tuple(lives.lives),
     )
 
 
@@ -235,6 +244,29 @@ def _on_frames(planned: PlannedDrone, received: Estimates) -> tuple[Estimates, N
     at_ns = np.where(fits, frames[nearest], received.at_ns)
     exact = Estimates(at_ns, received.world_from_body, received.covariances)
     return exact, np.where(fits, nearest, -1)
+
+
+def _of_given(
+    lives: Lives | None, estimates: Estimates, frame_of: NDArray[np.int64]
+) -> tuple[Estimates, NDArray[np.int64]]:
+    """Leave out poses of frames that a daemon had in hand when it was killed."""
+    if lives is None or not any(life.killed_at_ns is not None for life in lives.lives):
+        return estimates, frame_of
+    kept = np.flatnonzero((frame_of < 0) | np.isin(frame_of, np.array(lives.frames)))
+    poses = tuple(estimates.world_from_body[n] for n in kept)
+    left = Estimates(estimates.at_ns[kept], poses, estimates.covariances[kept])
+    return left, frame_of[kept]
+
+
+def _whose_maps(plan: FlightPlan, logs: Mapping[str, FlightLog], lives: Mapping[str, Lives]) -> str:
+    """Return whose maps are told of: the leader's, unless others went on without it."""
+
+    def went_on(name: str) -> bool:
+        last = lives[name].lives[-1:] if name in lives else [Life(0)]
+        return bool(logs[name].maps) and any(life.killed_at_ns is None for life in last)
+
+    names = [plan.leader, *(d.name for d in plan.drones)]
+    return next(filter(went_on, names), plan.leader)
 
 
 def _alignment(

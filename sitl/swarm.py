@@ -1,25 +1,37 @@
 """A flying swarm: per drone one real daemon, one stand-in autopilot, one camera server.
 
-Between the daemons lies a relay, which is the radio.
+Between the daemons lies a relay, which is the radio. A daemon may be started late, or killed and
+started again (``absences``): its autopilot, its camera and its place on the radio stay.
 """
 
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import socket
 import sys
 import time
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import sitl
 from sitl.daemon_config import daemon_config, key_path, toml_text
 from sitl.frame_server import FrameServer
+from sitl.lives import Life, Lives, log_path, write_lives
 from sitl.network import Network
 from sitl.network_log import write_network_log
 from sitl.plan import FlightPlan, PlannedDrone
-from sitl.processes import Child, FlightError, end_children, start_child, unless_one_ends
+from sitl.processes import (
+    Child,
+    FlightError,
+    end_children,
+    kill_child,
+    start_child,
+    unless_one_ends,
+)
 from sitl.relay import Relay
 from sitl.stand_in_process import StandIn, start_stand_in
 from vcl_companion.links.key_file import make_key_file
@@ -57,25 +69,26 @@ class Swarm:
 
     Attributes:
         drones: in the plan's order, once started.
-        daemons: their processes, in the same order.
+        children: every process of the swarm that should be running.
     """
 
     def __init__(self, plan: FlightPlan, out: Path) -> None:
         self.drones: list[FlyingDrone] = []
-        self.daemons: list[Child] = []
+        self.children: list[Child] = []
         self._plan = plan
         self._out = out.resolve()
         self._cameras: list[FrameServer] = []
-        self._stand_ins: list[Child] = []
+        self._daemons: dict[str, Child] = {}
+        self._lives = {planned.name: Lives() for planned in plan.drones}
+        absences = plan.options.absences
+        self._kills = sorted((a.from_s, a.drone) for a in absences if a.from_s > 0.0)
+        self._starts = sorted((a.until_s, a.drone) for a in absences if a.until_s < math.inf)
         self._relay: Relay | None = None
-
-    @property
-    def children(self) -> list[Child]:
-        """Every process of the swarm."""
-        return [*self._stand_ins, *self.daemons]
 
     async def start(self) -> None:
         """Start all processes and wait until every daemon has connected to its camera.
+
+        Daemons that are late are not among them.
 
         Raises:
             FlightError: one does not start, or ends at once.
@@ -86,7 +99,7 @@ class Swarm:
             camera = FrameServer(planned.name)
             self._cameras.append(camera)
             child = await start_stand_in(self._plan, planned, self._out, _environment())
-            self._stand_ins.append(child)
+            self.children.append(child)
             self.drones.append(FlyingDrone(planned, camera, await StandIn.of(child)))
         camera_ports = [await camera.start() for camera in self._cameras]
         # Its own ports first: they are held, so none of the daemons' can be the same.
@@ -101,16 +114,38 @@ class Swarm:
             )  # fmt: skip
             path = self._run_folder(drone.planned) / "daemon.toml"
             path.write_text(toml_text(config), encoding="utf-8")
-            command = (sys.executable, "-m", "vcl_companion.cli", "run", "--config", str(path))
-            self.daemons.append(
-                await start_child(
-                    f"daemon of {drone.planned.name}",
-                    command,
-                    log_prefix=path.with_suffix(""),
-                    environment=_environment(),
-                )
-            )
-        await unless_one_ends(self.children, self._all_connected())
+        late = {a.drone for a in self._plan.options.absences if a.from_s == 0.0}
+        there = [drone for drone in self.drones if drone.planned.name not in late]
+        for drone in there:
+            await self._start_daemon(drone, self._plan.starts_at_ns)
+        await unless_one_ends(self.children, self._all_connected(there))
+        for drone in there:
+            self._life(drone).ready_at_ns = self._plan.starts_at_ns
+
+    async def kill_and_start(self, at_ns: int) -> None:
+        """Kill and start the daemons whose time it is; note who is ready by now.
+
+        Where the daemons set the pace, the recording stands still until one that is started
+        is ready; else it goes on, as flight does.
+
+        Raises:
+            FlightError: one is not ready within the time, where that is waited for.
+        """
+        flight_s = (at_ns - self._plan.starts_at_ns) * 1e-9
+        while self._kills and self._kills[0][0] <= flight_s:
+            await self._kill(self._named(self._kills.pop(0)[1]), at_ns)
+        started = []
+        while self._starts and self._starts[0][0] <= flight_s:
+            started.append(self._named(self._starts.pop(0)[1]))
+            await self._start_daemon(started[-1], at_ns)
+        if started and math.isinf(self._plan.options.speed):
+            await self._all_connected(started)
+            for drone in started:
+                drone.camera.tell_time(at_ns)
+            await self.clocks_related(at_ns, started)
+        for drone in self.drones:
+            if drone.camera.is_connected and self._life(drone).ready_at_ns is None:
+                self._life(drone).ready_at_ns = at_ns
 
     async def advance_to(self, at_ns: int) -> None:
         """Move every autopilot's time on, and the network's."""
@@ -118,17 +153,23 @@ class Swarm:
             self._relay.flight_s = (at_ns - self._plan.starts_at_ns) * 1e-9
         await asyncio.gather(*(drone.stand_in.advance_to(at_ns) for drone in self.drones))
 
-    async def clocks_related(self, at_ns: int) -> None:
+    async def clocks_related(self, at_ns: int, drones: Sequence[FlyingDrone] = ()) -> None:
         """Hold the time at an instant until every daemon knows its autopilot's clock.
 
         A question that is on its way while time steps on is answered too late,
         and the attitude of the first frames would depend on it. Not for ever:
         what a daemon makes of silence is its own matter.
+
+        Args:
+            at_ns: the instant.
+            drones: whose daemons were just started; all that are connected if not given.
         """
+        asking = drones or [drone for drone in self.drones if drone.camera.is_connected]
+        before = [await drone.stand_in.advance_to(at_ns) if drones else 0 for drone in asking]
         deadline_s = time.monotonic() + _CLOCKS_TIMEOUT_S
         while time.monotonic() < deadline_s:
-            told = [await drone.stand_in.advance_to(at_ns) for drone in self.drones]
-            if min(told) >= _N_EXCHANGES:
+            told = [await drone.stand_in.advance_to(at_ns) for drone in asking]
+            if min(now - then for now, then in zip(told, before, strict=True)) >= _N_EXCHANGES:
                 return
             await asyncio.sleep(_LOOK_S)
 
@@ -138,17 +179,24 @@ class Swarm:
         Raises:
             FlightError: one ended in another way than it should.
         """
-        stubborn = await end_children(self.daemons, _END_TIMEOUT_S)
+        for drone in self.drones:
+            if drone.planned.name in self._daemons and not drone.camera.is_connected:
+                await self._kill(drone, self._plan.ends_at_ns)  # it is still starting
+        daemons = [*self._daemons.values()]
+        stubborn = await end_children(daemons, _END_TIMEOUT_S)
         if stubborn:
             names = ", ".join(child.name for child in stubborn)
             raise FlightError(f"{names} did not end within {_END_TIMEOUT_S:.0f} s of SIGTERM")
-        for child in self.daemons:
+        for child in daemons:
             if child.process.returncode != 0:
                 raise FlightError(child.obituary())
         for drone in self.drones:
             await drone.stand_in.finish()
         if self._relay is not None:
             write_network_log(self._out, self._relay)
+        for drone in self.drones:
+            self._lives[drone.planned.name].frames = drone.camera.given
+        write_lives(self._out, self._lives)
 
     async def end(self) -> None:
         """End whatever of ours still runs."""
@@ -162,24 +210,56 @@ class Swarm:
         options = self._plan.options
         network = Network(options.network, options.seed)
         try:
-            return Relay([drone.planned.name for drone in self.drones], network)
+            names = [drone.planned.name for drone in self.drones]
+            return Relay(names, network, addressed=options.network.addressed)
         except OSError as error:
             raise FlightError(f"no sockets between the drones: {error.strerror}") from error
 
-    async def _all_connected(self) -> None:
+    async def _all_connected(self, drones: Sequence[FlyingDrone]) -> None:
         timeout_s = self._plan.options.start_timeout_s
         try:
             async with asyncio.timeout(timeout_s):
-                for camera in self._cameras:
-                    await camera.connected()
+                for drone in drones:
+                    await drone.camera.connected()
         except TimeoutError:
+            names = [d.planned.name for d in drones if not d.camera.is_connected]
             raise FlightError(
-                f"{self._waiting()} not connected to the camera within {timeout_s:.0f} s"
+                f"daemon of {', '.join(names)} not connected to the camera within {timeout_s:.0f} s"
             ) from None
 
-    def _waiting(self) -> str:
-        names = [c.drone for c in self._cameras if not c.is_connected]
-        return "daemon of " + ", ".join(names)
+    async def _start_daemon(self, drone: FlyingDrone, at_ns: int) -> None:
+        """Start a daemon, or start it again: with all the files that its last run has left."""
+        name = drone.planned.name
+        lives = self._lives[name].lives
+        path = self._run_folder(drone.planned) / "daemon.toml"
+        child = await start_child(
+            f"daemon of {name}",
+            (sys.executable, "-m", "vcl_companion.cli", "run", "--config", str(path)),
+            log_prefix=path.with_name(f"daemon-{len(lives)}" if lives else "daemon"),
+            environment=_environment(),
+        )
+        lives.append(Life(at_ns))
+        self._daemons[name] = child
+        self.children.append(child)
+
+    async def _kill(self, drone: FlyingDrone, at_ns: int) -> None:
+        child = self._daemons.pop(drone.planned.name)
+        self.children.remove(child)
+        await kill_child(child)
+        await drone.camera.was_killed()
+        self._life(drone).killed_at_ns = at_ns
+        run = self._run_folder(drone.planned)
+        with suppress(FileNotFoundError):
+            n_before = len(self._lives[drone.planned.name].lives) - 1
+            (run / "flight.jsonl").rename(log_path(run, n_before))
+
+    def _life(self, drone: FlyingDrone) -> Life:
+        """Return the last life of a drone's daemon; one that has not begun is of no account."""
+        lives = self._lives[drone.planned.name].lives
+        return lives[-1] if lives else Life(0)
+
+    def _named(self, name: str) -> FlyingDrone:
+        return next(drone for drone in self.drones if drone.planned.name == name)
 
     def _run_folder(self, planned: PlannedDrone) -> Path:
         return self._out / "run" / planned.name

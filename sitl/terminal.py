@@ -16,6 +16,7 @@ from rich.table import Table
 
 from sitl.fly import Progress
 from sitl.goals import Goal
+from sitl.lives_report import LIFE_COLUMNS, life_rows
 from sitl.network_report import DELAYS, NETWORK_COLUMNS, delay_text, message_rows
 
 
@@ -78,6 +79,13 @@ def show_report(console: Console, report: Mapping[str, Any], out: Path) -> None:
             _number(drone["resident_mb"], 0),
         )
     console.print(table)
+    lives = life_rows(report)
+    if lives:
+        heads = (label.replace(" s", "\ns") for _, label in LIFE_COLUMNS)
+        table = _numbers(("daemon", *heads))
+        for name, values in lives:
+            table.add_row(name, *(_number(value, 2) for value in values))
+        console.print(table)
     _show_network(console, report)
     for event in report["events"]:
         if event["kind"] == "harness":

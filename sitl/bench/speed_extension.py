@@ -19,6 +19,7 @@ from vcl_companion.daemon.map_offer import MapOffer, ReadyMap, ready_map
 from vcl_companion.daemon.scheduling import run_before_others
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.errors import RecordingError
+from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import NoMap
 from vcl_companion.mapping.update import extended
@@ -31,8 +32,18 @@ _SPACING_S = 1.2
 
 @dataclass(frozen=True)
 class _Round:
-    """One extension: wall and processor time of it, and wall time until it can be flown on, s."""
+    """One extension: what each part of it took, s.
 
+    Attributes:
+        look_s: wall time to decode all frames and find their features, done as each comes.
+        extend_s: wall time of the extension by frames that have been looked at.
+        extend_cpu_s: processor time of that.
+        ready_s: wall time until its map can be flown on.
+        n_landmarks: of that map.
+        n_keyframes: likewise.
+    """
+
+    look_s: float
     extend_s: float
     extend_cpu_s: float
     ready_s: float
@@ -66,7 +77,9 @@ def extension(scene: Scene, first: LandmarkMap, shots: list[Shot], n_rounds: int
 
     def extend() -> None:
         for k, seen in enumerate(contributed):
-            rounds.append(mapping.call("maps", "extend", seen, k).result())
+            views = [shot.view(k + 1, detected=False) for shot in seen]
+            looks = [mapping.call("maps", "look_at", view).result() for view in views]
+            rounds.append(mapping.call("maps", "extend", views, k, sum(looks)).result())
 
     beside_ms = load.during(extend)
     vision.shutdown()
@@ -76,7 +89,9 @@ def extension(scene: Scene, first: LandmarkMap, shots: list[Shot], n_rounds: int
     size = f"{n_rounds} rounds, to {last.n_landmarks} landmarks in {last.n_keyframes} keyframes"
     return [
         Figure("map extension, median", float(np.median(walls)), "s", 0.6,
-               note=f"wall time beside the load; {size}"),
+               note=f"wall time beside the load, frames looked at before as they come; {size}"),
+        Figure("its frames looked at, median", float(np.median([r.look_s for r in rounds])), "s",
+               note="wall time beside the load of all drones' frames, each as it comes"),
         Figure("map extension, longest", float(np.max(walls)), "s"),
         Figure("map extension, processor time", float(np.median([r.extend_cpu_s for r in rounds])),
                "s", note="median"),
@@ -103,22 +118,31 @@ class _Maker:
         self._current = ready_map(offer, None, "akaze", FEATURES, self._memory, True, {})
         return self._current
 
-    def extend(self, seen: list[Shot], k: int) -> _Round:
+    def look_at(self, view: DroneView) -> float:
+        """Do what a daemon does with a frame as it comes (``Workshop.look_at``); return s taken."""
+        begun_s = time.perf_counter()
+        self._memory.pyramid(view.image_bytes, view.camera)
+        self._memory.features(view.image_bytes, view.camera, MAPPING.detectors[0])
+        return time.perf_counter() - begun_s
+
+    def extend(self, views: list[DroneView], k: int, look_s: float) -> _Round:
         """Extend it by frames, and make what came of it ready."""
         if self._current is None:
             raise RuntimeError("there is no map yet")
-        views = [shot.view(k + 1, detected=False) for shot in seen]
-        old, revision = self._current.index.landmark_map, revision_of(self._current.data)
+        index = self._current.index
+        old, revision = index.landmark_map, revision_of(self._current.data)
         begun_s, cpu_s = time.perf_counter(), time.thread_time()
         made = extended(
-            old, revision, views, self._memory.features, MAPPING, pyramid_of=self._memory.pyramid
-        )
+            old, revision, views, self._memory.features, MAPPING,
+            pyramid_of=self._memory.pyramid, sure=index.uncertainty,
+        )  # fmt: skip
         extend_s, extend_cpu_s = time.perf_counter() - begun_s, time.thread_time() - cpu_s
         if isinstance(made, NoMap):
             raise RecordingError(f"round {k + 1}: the map cannot be extended: {made.reason}")
         begun_s = time.perf_counter()
         self.begin(encode_map(made))
         return _Round(
+            look_s,
             extend_s,
             extend_cpu_s,
             time.perf_counter() - begun_s,

@@ -29,7 +29,7 @@ _RIGHT_M = 0.15
 _START = (
     "import cv2; cv2.setNumThreads(1)\n"
     "import vcl_companion.daemon.assemble\n"
-    "from vcl_companion.mapping.warm_up import warm_up; warm_up()"
+    "from vcl_companion.wire.warm_up import warm_up; warm_up()"
 )
 
 

@@ -185,8 +185,7 @@ def write_scale(out: Path, report: dict[str, Any]) -> None:
     text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
     (out / "scale.json").write_text(text + "\n", encoding="utf-8")
     (out / "scale.md").write_text(markdown_of(report), encoding="utf-8")
-    plot = plot_of(report).replace("<svg", '<svg xmlns="http://www.w3.org/2000/svg"', 1)
-    (out / "scale.svg").write_text(plot, encoding="utf-8")
+    (out / "scale.svg").write_text(plot_of(report), encoding="utf-8")
 
 
 def show_scale(console: Console, report: dict[str, Any], out: Path) -> None:

@@ -18,9 +18,9 @@ from sitl.scale.meter import MeteredLoop
 from sitl.wall import Scene
 from vcl_companion.links.key_file import make_key_file
 from vcl_companion.mapping.landmark_map import LandmarkMap
-from vcl_companion.mapping.warm_up import warm_up
 from vcl_companion.wire.map_codec import encode_map, revision_of
 from vcl_companion.wire.map_update import encode_map_update
+from vcl_companion.wire.warm_up import warm_up
 
 _N_KEYFRAMES = 24
 _LOOK_S = 0.02

@@ -28,7 +28,7 @@ from sitl.torture.report import TortureOptions, is_good, report_of, show_torture
 from sitl.torture.session import Failure, SessionResult, run_session
 from vcl_companion.daemon.usage import share_freed
 from vcl_companion.errors import ConfigError
-from vcl_companion.mapping.warm_up import warm_up
+from vcl_companion.wire.warm_up import warm_up
 
 Progress = Callable[[int, int], None]
 

@@ -18,6 +18,7 @@ from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.swarm.transfer import BlobKind
 from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame, encode_frame
 from vcl_companion.wire.map_codec import decode_map, encode_map
+from vcl_companion.wire.map_part import decode_map_part, encode_map_part
 from vcl_companion.wire.map_update import (
     decode_map_update,
     images_in_update,
@@ -91,6 +92,11 @@ def _decoded(
         case BlobKind.MAP:
             landmark_map = decode_map(blob)
             _check(blob, encode_map(landmark_map))
+            return landmark_map
+        case BlobKind.MAP_PART:
+            whole, data = decode_map_part(blob)
+            landmark_map = decode_map(data)
+            _check(blob, encode_map_part(whole, encode_map(landmark_map)))
             return landmark_map
         case BlobKind.MAP_UPDATE:
             for read in _READ_OF_UPDATES:

@@ -22,6 +22,7 @@ from vcl_companion.swarm.transfer import BlobKind
 from vcl_companion.wire.chunks import MAX_CHUNKS, Reply, TransferStatus, receiving_statuses
 from vcl_companion.wire.frame_codec import FrameAnswer, encode_frame
 from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
+from vcl_companion.wire.map_part import encode_map_part
 from vcl_companion.wire.map_update import encode_map_update, name_of_image, without_images
 from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
 from vcl_companion.wire.pose_messages import (
@@ -88,7 +89,7 @@ class Valid:
         self._blobs: tuple[Callable[[int], tuple[BlobKind, bytes]], ...] = (
             self._frame_answer, self._frame_answer, self._frame_answer, self._passed_frame,
             self._passed_frame, self._pose_request, self._pose_request, self._whole_map,
-            self._odd_map, self._odd_map, self._update, self._update,
+            self._odd_map, self._odd_map, self._part, self._update, self._update,
         )  # fmt: skip
 
     def message(self, peer: int) -> Payload:
@@ -219,6 +220,11 @@ class Valid:
         camera = self._dice.pick(_CAMERAS)
         at_ns = self._dice.word()
         return Keyframe(peer, at_ns, self._pose(5.0), SENSOR.body_from_cam, camera, image)
+
+    def _part(self, peer: int) -> tuple[BlobKind, bytes]:
+        """Return a map as if it were a part of another."""
+        _, data = self._odd_map(peer) if self._dice.below(2) else self._whole_map(peer)
+        return BlobKind.MAP_PART, encode_map_part(self._dice.rng.bytes(8), data)
 
     def _update(self, peer: int) -> tuple[BlobKind, bytes]:
         """Return an update of the drone's map, every third time one that leaves an image out."""

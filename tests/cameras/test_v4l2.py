@@ -153,8 +153,9 @@ def test_closing_while_a_frame_is_awaited_ends_the_frames(tmp_path: Path) -> Non
         camera = camera_of(lambda: device)
         waiting = asyncio.ensure_future(anext(camera.frames(), "ended"))
         await asyncio.sleep(0)
-        may_read.release()
         closing = asyncio.ensure_future(camera.close())
+        # It has been told to end before its next frame comes, however fast its thread is.
+        await asyncio.sleep(0)
         may_read.release()
         await closing
         return await waiting

@@ -380,9 +380,13 @@ class Swarm:
                 templates=demo.templates(*flies_on),
             )
         if runs:
-            await life.enter_async_context(beside(drone.run()))
-            await drone.autopilot.states.get()
+            await self.begin(drone)
         return drone
+
+    async def begin(self, drone: Drone) -> None:
+        """Have a drone run that does not yet."""
+        await self._lives[drone.system_id].enter_async_context(beside(drone.run()))
+        await drone.autopilot.states.get()
 
     async def stop(self, drone: Drone | Stranger) -> None:
         """End a drone."""

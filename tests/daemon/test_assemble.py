@@ -20,8 +20,8 @@ import pytest
 from sitl.daemon_config import toml_text
 from tests.daemon import demo
 from tests.ports import free_ports
-from vcl_companion.mapping.warm_up import warm_up
 from vcl_companion.recording import Description, RecordingWriter
+from vcl_companion.wire.warm_up import warm_up
 
 ROOT = Path(__file__).parents[2]
 N_FRAMES = 4

@@ -128,7 +128,8 @@ def nobody_to_ask(work: MapWork, clock: ManualClock) -> InterTarget:
     alone = HostChoice(Group(SwarmOptions(), DRONE))
     return InterTarget(
         DRONE, alone, demo.sensor(DRONE), clock, work, lambda _, __: 0, lambda _: None,
-        lambda _, __: None, InterMavOptions(), np.random.default_rng(0), only_the_surer=True,
+        lambda _: 0.1, lambda _, __: None, InterMavOptions(), np.random.default_rng(0),
+        only_the_surer=True,
     )  # fmt: skip
 
 
@@ -327,8 +328,7 @@ def test_frames_that_never_reached_us_are_counted(tmp_path: Path) -> None:
     async def scenario() -> None:
         async with flying(tmp_path) as up:
             up.fly_on_a_map()
-            up.server.n_given = 10  # it numbers them with a gap
-            up.give(0, sequence=3)
+            up.give(0, sequence=3)  # it numbers them with gaps
             await until(lambda: 3 in up.server.outcomes)
             up.give(1, sequence=7)
             await until(lambda: 7 in up.server.outcomes)

@@ -331,7 +331,7 @@ def test_maps_and_frames_that_are_none_are_counted_and_harm_nothing(tmp_path: Pa
             two, one = await members.start(2), await members.stranger(1)
             await one.meets(2)
             bad_maps = (
-                b"\x02\x42 no map",
+                b"\x03\x42 no map",
                 PAIR[:-1],
                 encode_map(small_map()),  # well formed, but its images are none
                 encode_frame(demo.answer(1)),
@@ -339,7 +339,7 @@ def test_maps_and_frames_that_are_none_are_counted_and_harm_nothing(tmp_path: Pa
             for n, blob in enumerate(bad_maps, start=1):
                 one.hand(BlobKind.MAP, blob, 2)
                 await until(counted(two, "map", n))
-            for n, blob in enumerate((b"", b"\x02\x41", PAIR), start=1):
+            for n, blob in enumerate((b"", b"\x03\x41", PAIR), start=1):
                 one.hand(BlobKind.FRAME_ANSWER, blob, 2)
                 await until(counted(two, "frame", n))
             assert two.revision == b""

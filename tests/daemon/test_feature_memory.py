@@ -27,6 +27,16 @@ def test_what_is_remembered_is_what_is_found() -> None:
     assert memory.features(IMAGE, CAMERA, "akaze") is first
 
 
+def test_features_of_an_image_that_was_decoded_before_are_the_same() -> None:
+    memory = FeatureMemory(demo.FEATURES)
+    pyramid = memory.pyramid(IMAGE, CAMERA)
+    image = decode_image(IMAGE, CAMERA)
+    assert np.array_equal(pyramid.image, image)
+    found, anew = memory.features(IMAGE, CAMERA, "akaze"), detect(image, "akaze", demo.FEATURES)
+    assert np.array_equal(found.pixels, anew.pixels)
+    assert np.array_equal(found.descriptors, anew.descriptors)
+
+
 def test_the_image_that_was_asked_for_longest_ago_is_forgotten() -> None:
     memory = FeatureMemory(demo.FEATURES, n_images=2)
     images = [demo.answer(system_id).image_bytes for system_id in (1, 2, 3)]

@@ -19,6 +19,7 @@ from vcl_companion.daemon.estimator import HISTORY_S
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.swarm.transfer import BlobKind
+from vcl_companion.wire.map_codec import revision_of
 from vcl_companion.wire.messages import MapState
 from vcl_companion.wire.pose_messages import (
     PoseProposal,
@@ -345,6 +346,32 @@ def test_a_host_without_a_pose_of_that_time_or_on_another_map_says_so(tmp_path: 
     run(scenario())
 
 
+def test_a_host_that_has_an_update_already_answers_who_still_waits_for_it(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            host = await members.start(2, (1, 2), inter=replace(INTER, every_n_frames=0))
+            stranger = await members.stranger(1)
+            await stranger.meets(2)
+            before, update = host.revision, demo.encoded_update()
+            stranger.hand(BlobKind.MAP, update, 2)
+            await until(lambda: host.revision == revision_of(update))
+            async with flying(host) as two:
+                two.give(0)
+                await two.server.answered()
+                frame = demo.answer(1, 0, request_id=5)
+                stranger.hand(
+                    BlobKind.POSE_REQUEST, encode_pose_request(PoseRequest(before, frame)), 2
+                )
+                said = await answer_to(stranger)
+                assert isinstance(said, PoseProposal)
+                assert said.revision == before
+                assert_pose_close(
+                    said.world_from_body, demo.world_from_body(1, 0), within_m=0.3, within_rad=0.02
+                )
+
+    run(scenario())
+
+
 async def answer_to(stranger: Stranger) -> PoseProposal | PoseRefused:
     """Wait for the next answer about a pose."""
     while True:
@@ -365,7 +392,7 @@ def test_hostile_requests_are_counted_or_refused_and_the_host_flies_on(
             async with flying(host) as one:
                 one.give(0)
                 await one.server.answered()
-                for blob in (b"", b"\x02\x43", b"\x02\x43" + bytes(300)):
+                for blob in (b"", b"\x03\x43", b"\x03\x43" + bytes(300)):
                     stranger.hand(BlobKind.POSE_REQUEST, blob, 1)
                 await until(lambda: host.exchange.refused.get("pose request", 0) >= 1)
                 # Of another drone than the one that asks.

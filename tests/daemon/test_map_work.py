@@ -21,6 +21,7 @@ from vcl_companion.localization.intra import LocalizationOptions, Localized
 from vcl_companion.localization.pipeline import ALL_EFFORT, PipelineOptions
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.options import NoMap
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.wire.header import BlobKind
 from vcl_companion.wire.map_codec import encode_map, revision_of
@@ -64,7 +65,12 @@ def test_a_first_map_is_made_and_made_ready(work: MapWork) -> None:
         built = await work.first_map(frames, demo.LEADER)
         assert isinstance(built, LandmarkMap)
         handed = await work.encoded(built, None)
-        assert (handed.data, handed.update) == (encode_map(built), b"")
+        assert handed.data == encode_map(built)
+        for offer in (
+            MapOffer.of(BlobKind.MAP, handed.data),
+            MapOffer.of(BlobKind.MAP_UPDATE, handed.update),
+        ):
+            assert (await work.ready(offer, None, {})).data == handed.data
         ready = await work.ready(MapOffer.of(BlobKind.MAP, handed.data), None, {})
         assert ready.stored().revision == handed.revision
         assert ready.templates is not None
@@ -81,6 +87,26 @@ def test_a_map_that_it_has_not_seen_is_handed_over_and_extended(work: MapWork) -
         assert built.parent == revision_of(PAIR)
         handed = await work.encoded(built, pair())
         assert 0 < len(handed.update) < len(handed.data)
+
+    run(check())
+
+
+def test_another_map_is_merged_into_the_one_in_use(work: MapWork) -> None:
+    other = demo.encoded_map(1, 2, 3)
+
+    async def check() -> None:
+        built = await work.merged(pair(), other)
+        # Drones 1 and 2 are in both, at one instant.
+        assert isinstance(built, LandmarkMap), built
+        assert built.parent == built.world == revision_of(PAIR)
+        assert [k.drone_id for k in built.keyframes] == [1, 2, 3]
+        assert [j.revision for j in built.joined] == [revision_of(other)]
+        handed = await work.encoded(built, pair())
+        assert 0 < len(handed.update) < len(handed.data)
+        with pytest.raises(WireError):
+            await work.merged(pair(), other[:-7])
+        itself = await work.merged(pair(), PAIR)
+        assert isinstance(itself, NoMap)
 
     run(check())
 

@@ -29,7 +29,7 @@ PAIR = demo.encoded_map(1, 2)
 class Member:
     """The frames that one drone of three passes on and holds, and what it handed to whom."""
 
-    def __init__(self, own_id: int) -> None:
+    def __init__(self, own_id: int, *, all_hear: bool = False) -> None:
         group = Group(SwarmOptions((1, 2, 3)), own_id)
         for peer in {1, 2, 3} - {own_id}:
             group.heartbeat(peer, 0.0)
@@ -40,6 +40,7 @@ class Member:
             MapWork(
                 demo.workshop(SwarmOptions((1, 2, 3)), demo.sensor(own_id), INTER), forks=False
             ),
+            lambda: all_hear,
         )  # fmt: skip
 
     def _hand(self, peer: int, blob: bytes) -> int:
@@ -71,6 +72,30 @@ def test_a_frame_goes_to_everybody_who_did_not_take_it_and_once() -> None:
     assert one.frames.on_their_way_to(3) == {of_two}
     one.frames.pass_on(own)  # what failed is tried again
     assert [peer for peer, _ in one.handed] == [2, 3, 3, 3]
+
+
+def test_what_all_have_heard_is_not_passed_on_and_held_by_who_says_so() -> None:
+    one = Member(1, all_hear=True)
+    two_s, three_s = frame_of(2, b"of two"), frame_of(3, b"of three")
+    of_two, of_three = name_of_image(b"of two"), name_of_image(b"of three")
+    one.frames.is_held(3, b"digest 2")  # before we have it ourselves
+    for frame, digest in ((two_s, b"digest 2"), (three_s, b"digest 3")):
+        one.frames.answered(frame, digest)
+        one.frames.pass_on_answer(frame)
+    assert not one.handed
+    assert one.frames.held_by(3) == {of_two, of_three}
+    assert one.frames.held_by(2) == {of_two}  # it has not said so yet
+    one.frames.is_held(2, b"digest 3")
+    assert one.frames.held_by(2) == {of_two, of_three}
+    one.frames.is_held(2, b"digest of something else")
+    one.frames.forgot(2)
+    assert one.frames.held_by(2) == frozenset()
+
+
+def test_what_a_member_gives_to_the_coordinator_is_held_where_it_is_heard() -> None:
+    three = Member(3)
+    three.frames.overheard(frame_of(2, b"of two"))
+    assert three.frames.held[name_of_image(b"of two")] == b"of two"
 
 
 def test_what_nobody_needs_any_more_is_stopped() -> None:
@@ -139,6 +164,7 @@ def test_an_update_comes_without_the_images_that_were_sent_ahead(tmp_path: Path)
             assert revision_of(data) == one.revision
             assert len(data) - len(update) > 20_000
             await computed(lambda: two.revision == one.revision)
-            assert dict(two.exchange.refused) == {}
+            # Clocks that the test moves one after the other do not fit each other for a moment.
+            assert set(two.exchange.refused) <= {"time"}
 
     run(scenario())

@@ -13,11 +13,13 @@ from hypothesis import strategies as st
 from tests.checks import assert_consistent, assert_pose_close, numeric_jacobian
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, matrix_from_euler
+from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.localization.intra import Localized, NotLocalized
 from vcl_companion.localization.pose_filter import (
     FilterOptions,
     FilterState,
     _observation,
+    carried,
     predict,
     started,
     update,
@@ -453,6 +455,38 @@ def test_the_observation_s_jacobian_is_the_numeric_one(attitude: Array | None) -
 
     numeric = numeric_jacobian(seen, np.zeros(24))
     np.testing.assert_allclose(_observation(state, fix), numeric, atol=1e-8)
+
+
+@pytest.mark.parametrize("attitude", [matrix_from_euler(0.2, 0.1, -0.7), None])
+def test_in_another_world_it_is_the_same_state_with_the_same_errors(attitude: Array | None) -> None:
+    rng = np.random.default_rng(9)
+    state = moving_state(rng, attitude)
+    way = Similarity(matrix_from_euler(0.0, 0.0, 2.0), np.array([5.0, -7.0, 1.0]), 1.02)
+    there = carried(state, way)
+    exactly = {"within_m": 1e-9, "within_rad": 1e-9}
+    assert_pose_close(there.world_from_body, way.of_pose(state.world_from_body), **exactly)
+    ahead, ahead_there = (predict(one, 500_000_000, attitude, STEADY) for one in (state, there))
+    assert ahead is not None
+    assert ahead_there is not None
+    assert_pose_close(ahead_there.world_from_body, way.of_pose(ahead.world_from_body), **exactly)
+
+    def error_there(error: Array) -> Array:
+        truth = carried(displaced(state, error), way)
+        turned = log_so3(truth.world_from_ned @ there.world_from_ned.T)
+        sample = there.world_from_ned.T @ there.world_from_body.rotation
+        left = truth.world_from_ned.T @ truth.world_from_body.rotation
+        return np.concatenate(
+            [
+                truth.world_from_body.translation - there.world_from_body.translation,
+                turned,
+                truth.velocity_world - there.velocity_world,
+                log_so3(sample.T @ left),
+            ]
+        )
+
+    moving = numeric_jacobian(error_there, np.zeros(12))
+    own = state.covariance[:12, :12]
+    np.testing.assert_allclose(there.covariance[:12, :12], moving @ own @ moving.T, atol=1e-7)
 
 
 @pytest.mark.parametrize("before", [matrix_from_euler(0.2, 0.1, -0.7), None])

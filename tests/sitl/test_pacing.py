@@ -48,11 +48,11 @@ def test_flat_out_nothing_happens_between_frames_but_one_sample() -> None:
 def test_the_first_map_is_waited_for_when_all_have_their_first_frame() -> None:
     times = [np.array([0, 200, 400]), np.array([250, 450])]
     moments = instants([t * 1_000_000 for t in times], flat_out=True)
-    assert [m.at_ns // 1_000_000 for m in moments][gate(moments, 2)] == 270
+    assert [m.at_ns // 1_000_000 for m in moments][gate(moments, {0, 1})] == 270
     hurried = [Instant(0, (Due(0, 0),)), Instant(5, (Due(1, 0),)), Instant(9, (Due(0, 1),))]
-    assert gate(hurried, 2) == 1
+    assert gate(hurried, {0, 1}) == 1
     with pytest.raises(ValueError, match="no frame"):
-        gate(hurried, 3)
+        gate(hurried, {0, 1, 2})
 
 
 def test_pace_counts_from_its_origin() -> None:

@@ -90,7 +90,7 @@ def test_copies_to_several_peers_and_of_several_drones_are_counted_each() -> Non
     traffic.count("mav1", state)
     assert traffic.sent["mav0"] == {"heartbeat": Traffic(2, 0, 2 * len(heartbeat))}
     assert traffic.sent["mav1"]["heartbeat"].messages == 1
-    assert traffic.sent["mav1"]["map state"] == Traffic(1, 19, len(state))
+    assert traffic.sent["mav1"]["map state"] == Traffic(1, 33, len(state))
 
 
 def test_a_signature_is_thirteen_bytes_more_and_changes_nothing_else() -> None:

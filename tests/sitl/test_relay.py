@@ -45,9 +45,17 @@ class Drone:
 
 @asynccontextmanager
 async def swarm(
-    options: NetworkOptions | None = None, max_under_way_bytes: int = 1 << 20
+    options: NetworkOptions | None = None,
+    max_under_way_bytes: int = 1 << 20,
+    *,
+    addressed: bool = True,
 ) -> AsyncIterator[tuple[Relay, list[Drone]]]:
-    relay = Relay(NAMES, Network(options or NetworkOptions(), 1), max_under_way_bytes)
+    relay = Relay(
+        NAMES,
+        Network(options or NetworkOptions(), 1),
+        addressed=addressed,
+        max_under_way_bytes=max_under_way_bytes,
+    )
     drones = [Drone() for _ in NAMES]
     try:
         relay.start({name: drone.port for name, drone in zip(NAMES, drones, strict=True)})
@@ -74,6 +82,23 @@ def test_a_datagram_comes_from_where_its_answer_goes() -> None:
             assert await a.heard() == (b"answer", to_b)
             a.send(b"other", to_c)
             assert await c.heard() == (b"other", relay.ports("mav2")[0])
+
+    run(test())
+
+
+def test_on_one_air_all_hear_what_one_sends_and_it_counts_once() -> None:
+    async def test() -> None:
+        async with swarm(addressed=False) as (relay, (a, b, c)):
+            airs = {name: relay.ports(name) for name in NAMES}
+            assert all(len(ports) == 1 for ports in airs.values())
+            a.send(b"to all", airs["mav0"][0])
+            assert await b.heard() == (b"to all", airs["mav1"][0])
+            assert await c.heard() == (b"to all", airs["mav2"][0])
+            b.send(b"back", airs["mav1"][0])
+            assert await a.heard() == (b"back", airs["mav0"][0])
+            assert await c.heard() == (b"back", airs["mav2"][0])
+            messages = [t.messages for t in relay.traffic.sent["mav0"].values()]
+            assert messages == [1]
 
     run(test())
 

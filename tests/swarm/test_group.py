@@ -107,6 +107,17 @@ def test_the_coordinator_is_the_leader_until_it_was_heard_and_lost() -> None:
     assert group.coordinator == 1
 
 
+def test_a_leader_never_heard_is_not_waited_for_for_ever() -> None:
+    group = Group(SwarmOptions((1, 2, 3), leader_wait_s=20.0), 2)
+    for second in range(20):
+        group.heartbeat(3, float(second))
+        group.poll(float(second))
+        assert group.coordinator == 1
+    group.heartbeat(3, 20.0)
+    group.poll(20.0)
+    assert group.is_coordinator
+
+
 def test_a_configured_leader_coordinates() -> None:
     group = Group(SwarmOptions(members=(1, 2, 3), leader=2), 1)
     assert (group.leader, group.coordinator) == (2, 2)

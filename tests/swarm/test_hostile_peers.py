@@ -13,6 +13,7 @@ from tests.swarm.network import Network
 from tests.wire.strategies import chunks, statuses
 from vcl_companion.swarm.budget import FRAME_OVERHEAD_BYTES
 from vcl_companion.swarm.transfer import (
+    BlobHeld,
     BlobKind,
     BlobReceived,
     Event,
@@ -155,7 +156,9 @@ def test_answers_of_a_stranger_change_nothing() -> None:
         TransferStatus(tag, Reply.COMPLETE, 1, digest=digest),
         TransferStatus(tag, Reply.CORRUPT, 1),
     ):
-        assert sender.receive(3, status, network.now_s) == []
+        events = sender.receive(3, status, network.now_s)
+        assert all(isinstance(event, BlobHeld) for event in events)  # what it says of itself
+    assert network.ends() == []
     wrong = TransferStatus(tag, Reply.COMPLETE, 1, digest=bytes(8))
     assert sender.receive(2, wrong, network.now_s) == []
     network.run(200.0, stop=lambda: bool(network.ends()))

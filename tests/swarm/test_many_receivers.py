@@ -10,12 +10,14 @@ from hypothesis import strategies as st
 from tests.swarm.network import CALM, DEFAULTS, Network, Weather
 from vcl_companion.swarm.transfer import (
     BlobDelivered,
+    BlobHeld,
     BlobKind,
     BlobReceived,
     TransferFailed,
     TransferOptions,
 )
 from vcl_companion.swarm.transfer_options import PROFILES
+from vcl_companion.wire.chunks import describe
 
 MAP = BlobKind.MAP
 BLOB = np.random.default_rng(0).bytes(100_000)
@@ -237,3 +239,20 @@ def test_what_is_too_long_for_one_answer_arrives_too() -> None:
     send(network, blob, 2, 3)
     assert [network.blobs(peer) == [blob] for peer in (2, 3)] == [True, True]
     assert network.n_bytes < 1.2 * len(blob)
+
+
+def test_who_has_it_is_known_to_all_others_where_the_network_is_shared() -> None:
+    """The coordinator, one of several receivers, leaves out of a map what they have."""
+    network, blob = group(2), bytes(range(256)) * 20
+    send(network, blob, 2, 3)
+    digest = describe(MAP, blob).short_digest
+    held = {(drone, event.peer) for _, drone, event in network.log if isinstance(event, BlobHeld)}
+    assert held == {(2, 3), (3, 2)}
+    told = {event.digest for _, _, event in network.log if isinstance(event, BlobHeld)}
+    assert told == {digest}
+
+
+def test_where_it_is_not_shared_nobody_else_is_told() -> None:
+    network = group(2, is_shared=False)
+    send(network, bytes(1000), 2, 3)
+    assert not any(isinstance(event, BlobHeld) for _, _, event in network.log)

@@ -17,16 +17,21 @@ _DEMO = Path(__file__).parents[2] / "sitl" / "recordings" / "demo"
 _DATA = Path(__file__).parents[3] / "shared" / "data"
 
 
+def folder_of(name: str) -> Path:
+    """Return where the photographs of a name are; skip the test where they are not."""
+    folder = _DEMO if name == "demo" else _DATA / name
+    if not folder.is_dir():
+        pytest.skip(f"no photographs at {folder}")
+    return folder
+
+
 def photographed(name: str, n_views: int) -> tuple[Camera, list[Pose], Array]:
     """Return camera, true worlds_from_cams and (N, V, 2) ideal coordinates, NaN where unmatched.
 
     The views are one drone's first frames, of ``demo`` the first frames of its drones,
     all matched against the first by SIFT.
     """
-    folder = _DEMO if name == "demo" else _DATA / name
-    if not folder.is_dir():
-        pytest.skip(f"no photographs at {folder}")
-    drones = read_recording(folder).drones
+    drones = read_recording(folder_of(name)).drones
     if name == "demo":
         views = [(drone, drone.frames[0]) for drone in drones[:n_views]]
     else:

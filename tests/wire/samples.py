@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import exp_so3
-from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
+from vcl_companion.geometry.similarity import Similarity
+from vcl_companion.mapping.landmark_map import (
+    MAX_JOINED,
+    JoinedMap,
+    Keyframe,
+    KnownDistance,
+    LandmarkMap,
+)
 from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.pose_messages import PoseProposal
 
@@ -43,6 +52,9 @@ def random_map(
     observed_px = rng.uniform(0.0, 1.0, (n_landmarks, n_keyframes, 2)) * (sizes_px - 1)
     observed_px[rng.uniform(size=(n_landmarks, n_keyframes)) > seen_share] = np.nan
     distances = (KnownDistance(0, n_keyframes - 1, 3.456, 0.01),) if n_keyframes > 1 else ()
+    parent = rng.bytes(8) if rng.uniform() < 0.5 else b""
+    world = rng.bytes(8) if parent and rng.uniform() < 0.7 else b""
+    n_joined = int(rng.integers(MAX_JOINED + 1)) if world and rng.uniform() < 0.5 else 0
     return LandmarkMap(
         keyframes=keyframes,
         points_world=rng.uniform(-30.0, 60.0, (n_landmarks, 3)),
@@ -50,8 +62,43 @@ def random_map(
         pixel_noise_px=float(rng.uniform(0.05, 2.0)),
         detectors=[("akaze",), ("sift",), ("akaze", "sift"), ("orb",)][int(rng.integers(4))],
         distances=distances,
-        parent=rng.bytes(8) if rng.uniform() < 0.5 else b"",
+        parent=parent,
+        world=world,
+        joined=tuple(random_joined(rng) for _ in range(n_joined)),
     )
+
+
+def scene_map(rng: np.random.Generator, n_landmarks: int, n_keyframes: int) -> LandmarkMap:
+    """A map as a flight leaves it: cameras abreast, landmarks ahead, seen to 0.1 px."""
+    bodies = [
+        Pose(exp_so3(rng.normal(0.0, 0.02, 3)), np.array([*rng.normal(0.0, 0.2, 2), 1.5 * k]))
+        for k in range(n_keyframes)
+    ]
+    camera = CAMERAS[0]
+    keyframes = tuple(
+        Keyframe(k % 3 + 1, 200_000_000 * k, body, Pose.identity(), camera, f"image {k}".encode())
+        for k, body in enumerate(bodies)
+    )
+    z = rng.uniform(20.0, 40.0, n_landmarks) + 1.5 * n_keyframes
+    points = np.column_stack([rng.uniform(-0.5, 0.5, (n_landmarks, 2)) * z[:, None], z])
+    pixels = np.stack([camera.project(body.inverse().apply(points)) for body in bodies], axis=1)
+    pixels += 0.1 * rng.standard_normal(pixels.shape)
+    inside = ((pixels >= 0.0) & (pixels <= (639.0, 479.0))).all(axis=2)
+    pixels[~inside | (rng.uniform(size=inside.shape) < 0.2)] = np.nan
+    return LandmarkMap(
+        keyframes=keyframes,
+        points_world=points,
+        observed_px=pixels,
+        pixel_noise_px=0.1,
+        detectors=("akaze", "sift"),
+        distances=(),
+        parent=b"",
+    )
+
+
+def random_joined(rng: np.random.Generator) -> JoinedMap:
+    pose, scale = random_pose(rng), float(rng.uniform(0.9, 1.1))
+    return JoinedMap(rng.bytes(8), rng.bytes(8), Similarity(pose.rotation, pose.translation, scale))
 
 
 def small_map() -> LandmarkMap:
@@ -86,6 +133,20 @@ def small_map() -> LandmarkMap:
         detectors=("akaze",),
         distances=(KnownDistance(0, 1, 2.0, 0.01),),
         parent=bytes(range(8)),
+    )
+
+
+def small_merged_map() -> LandmarkMap:
+    """The small map, and two that were merged into it."""
+    turn = Pose.from_quaternion(np.array([0.8, 0.0, 0.0, 0.6]), np.array([3.0, -40.5, 2.25]))
+    there = Similarity(turn.rotation, turn.translation, 1.01)
+    return replace(
+        small_map(),
+        world=b"of first",
+        joined=(
+            JoinedMap(b"revision", b"of other", Similarity.identity()),
+            JoinedMap(b"another!", b"a branch", there),
+        ),
     )
 
 

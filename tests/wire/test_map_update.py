@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.wire.golden import assert_golden
-from tests.wire.samples import random_map, small_map
+from tests.wire.samples import random_map, scene_map, small_map
 from vcl_companion.errors import WireError
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.wire.header import (
@@ -27,7 +27,7 @@ from vcl_companion.wire.map_codec import (
     parent_of,
     revision_of,
 )
-from vcl_companion.wire.map_delta import encode_landmarks
+from vcl_companion.wire.map_delta import encode_changes
 from vcl_companion.wire.map_update import (
     decode_map_update,
     encode_map_update,
@@ -65,7 +65,7 @@ def test_golden_bytes() -> None:
     assert_golden("map_update", blob)
     assert decode_map_update(blob, PARENT, {}) == CHILD
     assert names_of_update(blob) == (revision_of(CHILD), parent_of(CHILD))
-    assert names_of_update(blob[:40]) == names_of_update(blob)
+    assert names_of_update(blob[:48]) == names_of_update(blob)
 
 
 def grown(rng: np.random.Generator, parent: LandmarkMap, n_new: int, n_views: int) -> LandmarkMap:
@@ -113,15 +113,35 @@ def test_what_comes_out_is_what_went_in(
 
 def test_what_has_not_changed_costs_next_to_nothing() -> None:
     rng = np.random.default_rng(5)
-    parent = decode_map(encode_map(random_map(rng, 1000, 6, seen_share=0.5)))
+    parent = decode_map(encode_map(scene_map(rng, 1000, 6)))
     moved = parent.points_world + 0.01 * rng.standard_normal((1000, 3))
     data = encode_map(replace(parent, points_world=moved, parent=b"12345678"))
     heads = len(
         encode_map(replace(parent, points_world=moved[:0], observed_px=parent.observed_px[:0]))
     )
-    # 8 bits of each coordinate's step, and a bit of each sighting, of 19 and 32.
-    assert len(encode_map_update(data, parent)) - heads < 4500
-    assert len(data) - heads > 18_000
+    # 3 bits of each coordinate's step, and next to nothing of a sighting.
+    assert len(encode_map_update(data, parent)) - heads < 1800
+    assert len(data) - heads > 9_000
+
+
+@given(st.integers(0, 2**32).map(np.random.default_rng), st.integers(1, 60), st.integers(0, 40))
+def test_a_scene_goes_on(rng: np.random.Generator, n_parent: int, n_new: int) -> None:
+    """A round later: its first keyframe is gone, there is a new one, landmarks have moved."""
+    whole = scene_map(rng, n_parent + n_new, 5)
+    parent = decode_map(encode_map(replace(
+        whole, keyframes=whole.keyframes[:4], points_world=whole.points_world[:n_parent],
+        observed_px=whole.observed_px[:n_parent, :4],
+    )))  # fmt: skip
+    moved = whole.points_world + 0.01 * rng.standard_normal(whole.points_world.shape)
+    culled = rng.uniform(size=whole.seen.shape) < 0.05
+    observed_px = np.where(culled[..., None], np.nan, whole.observed_px)
+    data = encode_map(replace(
+        whole, keyframes=whole.keyframes[1:], points_world=moved,
+        observed_px=observed_px[:, 1:], parent=b"12345678",
+    ))  # fmt: skip
+    update = encode_map_update(data, parent)
+    assert decode_map_update(update, parent, {}) == data
+    assert len(update) < len(data) + 8 + 4 + 30
 
 
 def test_golden_bytes_for_one_who_holds_the_new_image() -> None:
@@ -170,7 +190,7 @@ def test_an_image_that_would_be_taken_for_a_reference_is_not_encoded(image: byte
         encode_map_update(encode_map(odd), PARENT)
 
 
-@given(st.binary(max_size=200), st.sampled_from([b"", b"\x02", b"\x02\x44"]))
+@given(st.binary(max_size=200), st.sampled_from([b"", b"\x03", b"\x03\x44"]))
 def test_any_bytes_are_a_wire_error(body: bytes, head: bytes) -> None:
     with pytest.raises(WireError):
         decode_map_update(head + body, PARENT, {})
@@ -207,4 +227,28 @@ def test_many_references_to_a_large_image_are_refused_before_they_are_joined() -
     child = replace(PARENT, keyframes=many, observed_px=observed_px, distances=())
     blob = encode_header(BlobKind.MAP_UPDATE) + b"revision" + encode_head(MapHead.of(child))
     with pytest.raises(WireError, match="20971520 bytes of images"):
-        decode_map_update(blob + encode_landmarks(child, parent, [0] * 20), parent, {})
+        decode_map_update(blob + encode_changes(child, parent, [0] * 20), parent, {})
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 4))
+def test_a_first_map_comes_without_the_images_that_were_sent_ahead(
+    seed: int, n_landmarks: int, n_keyframes: int
+) -> None:
+    made = random_map(np.random.default_rng(seed), n_landmarks, n_keyframes, 1.0)
+    named = enumerate(made.keyframes)
+    keyframes = tuple(replace(k, image_bytes=b"picture %d" % n) for n, k in named)
+    data = encode_map(replace(made, keyframes=keyframes, parent=b"", world=b"", joined=()))
+    update = encode_map_update(data, None)
+    assert names_of_update(update) == (revision_of(data), b"")
+    assert decode_map_update(update, None, {}) == data
+    images = {name_of_image(k.image_bytes): k.image_bytes for k in decode_map(data).keyframes}
+    without = without_images(update, images)
+    assert images_missing_in(without) == frozenset(images)
+    assert decode_map_update(without, None, images) == data
+    with pytest.raises(WireError, match="sent ahead"):
+        decode_map_update(without, None, {})
+
+
+def test_one_without_a_map_cannot_be_told_what_its_parent_has() -> None:
+    with pytest.raises(WireError, match="no keyframe"):
+        decode_map_update(encode_map_update(CHILD, PARENT), None, {})

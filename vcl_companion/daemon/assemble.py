@@ -44,10 +44,10 @@ from vcl_companion.errors import VclError
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.peers import PeerLink, open_signing
 from vcl_companion.localization.pipeline import PipelineOptions
-from vcl_companion.mapping.warm_up import warm_up
 from vcl_companion.recording.sensor import read_sensor
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.transfer import Transfers
+from vcl_companion.wire.warm_up import warm_up
 
 _log = logging.getLogger(__name__)
 
@@ -113,7 +113,12 @@ async def _run(config: Config) -> int:
     outcomes = FrameOutcomes(camera, clock, health, log)
     # The paper's pipeline sends what it has measured, and nothing else.
     motion = config.filter if config.pipeline == "default" else replace(config.filter, coast_s=0.0)
-    estimator = Estimator(motion, config.localization, lambda why: log.event("jump", why))
+    estimator = Estimator(
+        motion,
+        config.localization,
+        lambda why: log.event("jump", why),
+        keeps_local=config.swarm.keeps_local,
+    )
     vision = Worker("vision")
     # Before anybody is told that we are here: no frame has to wait for the compiler.
     notify.status("compiling, once on this machine")

@@ -391,7 +391,7 @@ class Companion:
     ) -> NotLocalized | None:
         """Send the pose of a frame, at its own time; or say why it cannot be."""
         sent = self._autopilot.send_pose(
-            state.world_from_body,
+            self._estimator.local_from_world @ state.world_from_body,
             state.pose_covariance(),
             frame.captured_at_ns,
             self._estimator.n_resets,
@@ -411,7 +411,10 @@ class Companion:
         at_ns = frame.captured_at_ns
         state = self._estimator.coasted_at(at_ns) if at_ns > self._sent_at_ns else None
         coasted = state is not None and self._autopilot.send_pose(
-            state.world_from_body, state.pose_covariance(), at_ns, self._estimator.n_resets
+            self._estimator.local_from_world @ state.world_from_body,
+            state.pose_covariance(),
+            at_ns,
+            self._estimator.n_resets,
         )
         if coasted:
             self._sent_at_ns = at_ns

@@ -11,6 +11,7 @@ import numpy as np
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.localization.intra import (
     LocalizationOptions,
     Localized,
@@ -22,6 +23,7 @@ from vcl_companion.localization.pose_filter import (
     FilterOptions,
     FilterState,
     NotFused,
+    carried,
     predict,
     started,
     started_from_proposal,
@@ -47,6 +49,8 @@ class Estimator:
         options: of the filter.
         localization: how far a pose may disagree with the autopilot's attitude.
         jumped: told of a jump, and of what made it.
+        keeps_local: whether the autopilot goes on being told poses in the frame that it knows
+            when our map's world is left; else it is told the other world's, a jump.
     """
 
     def __init__(
@@ -54,7 +58,10 @@ class Estimator:
         options: FilterOptions,
         localization: LocalizationOptions,
         jumped: Callable[[str], None],
+        *,
+        keeps_local: bool = True,
     ) -> None:
+        self._keeps_local = keeps_local
         self._options = options
         self._localization = localization
         self._jumped = jumped
@@ -65,6 +72,8 @@ class Estimator:
         self._looked_at_ns = -1
         self._looked = asyncio.Event()
         self.n_resets = 0
+        self.local_from_world = Pose.identity()
+        """From the map's world to the frame that the autopilot is told poses in."""
         self.tracked = 0
         """Landmarks of the map that the last frame showed; 0 when it was refused."""
         self.covered = 0.0
@@ -237,6 +246,29 @@ class Estimator:
         if isinstance(fused, NotFused):
             return fused
         return self._history.at(at_ns) or fused
+
+    def carry(self, other_from_world: Similarity) -> None:
+        """Go on in another world, whose map takes the place of ours.
+
+        Where the autopilot takes us to be does not change by it, if it is to be so:
+        ``local_from_world`` does.
+        What is still to come of earlier frames is of the world that was left, and not taken.
+        """
+        newest = self._history.newest
+        self._history.clear()
+        if newest is not None:
+            there = carried(newest, other_from_world)
+            self._history.append(there, None, newest.ned_from_body)
+            was, now = newest.world_from_body, there.world_from_body
+        else:
+            was = Pose.identity()
+            now = other_from_world.of_pose(was)
+        if self._keeps_local:
+            self.local_from_world = self.local_from_world @ was @ now.inverse()
+        else:
+            self._jump("joined another world")
+        if self._own_fix is not None:
+            self._own_fix = carried(self._own_fix, other_from_world)
 
     def has_own_fix_near(self, at_ns: int) -> bool:
         """Whether a fix of our own, not two seconds from an instant, says where we were then."""

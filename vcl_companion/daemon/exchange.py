@@ -45,6 +45,7 @@ from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
 from vcl_companion.swarm.quarantine import Evidence, QuarantineOptions
 from vcl_companion.swarm.transfer import (
     BlobDelivered,
+    BlobHeld,
     BlobKind,
     BlobReceived,
     Event,
@@ -54,7 +55,7 @@ from vcl_companion.swarm.transfer import (
 from vcl_companion.swarm.updates import OwnVote, Sight, UpdateOptions
 from vcl_companion.swarm.urgency import Message
 from vcl_companion.vision.features import Detector
-from vcl_companion.wire.chunks import Chunk, TransferStatus
+from vcl_companion.wire.chunks import Chunk, TransferStatus, describe
 from vcl_companion.wire.frame_codec import decode_frame
 from vcl_companion.wire.header import VersionMismatchError
 from vcl_companion.wire.messages import MAX_TRACKED, FrameRequest, MapRefused, MapState
@@ -64,9 +65,14 @@ from vcl_companion.wire.tunnel import TunnelPayload, decode_payload, is_ours
 _log = logging.getLogger(__name__)
 
 _STATE_INTERVAL_S = 1.0
+# Nothing new to tell: that we are there the heartbeats say.
+_STATE_AT_REST_S = 2.0
+# So much more or less of the map in sight is news.
+_NEWS_SHARE = 0.1
 # Who joins is told soon, and all who join meanwhile with it: a group starts at one time.
 _STATE_TO_NEW_S = 0.2
 _STEP_S = 0.1
+_SIGNATURE_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -128,6 +134,7 @@ class Exchange:
         self._clock = clock
         self._log = log
         self._estimator = estimator
+        self._work = work
         self._options = options
         self._link: PeerLink | None = None
         self._refusals = Refusals(log)
@@ -142,6 +149,7 @@ class Exchange:
             partial(self._hand, BlobKind.PASSED_FRAME),
             transfers.cancel,
             work,
+            lambda: transfers.shares_network,
         )
         self._answers = FrameAnswers(
             system_id,
@@ -153,10 +161,9 @@ class Exchange:
             self.clocks,
             log,
             work,
-            partial(self._hand, BlobKind.FRAME_ANSWER),
+            self._hand_answer,
             transfers.cancel,
             self._passed.given,
-            options.map.keyframe_quality,
             transfers.image_bytes,
         )
         self._rounds = MapRounds(
@@ -188,6 +195,7 @@ class Exchange:
             self._passed,
             options.update.delivery_wait_s,
             len(options.detectors) > 1,
+            estimator.carry,
         )
         self.inter = InterTarget(
             system_id,
@@ -197,6 +205,7 @@ class Exchange:
             work,
             partial(self._hand, BlobKind.POSE_REQUEST),
             transfers.cancel,
+            transfers.carried_in_s,
             self.trust.judged,
             options.inter,
             rng,
@@ -280,20 +289,24 @@ class Exchange:
             parts.create_task(self._passed.run())
             parts.create_task(self._sharing.run())
             parts.create_task(self._inter_host.run())
+            parts.create_task(self._look_around())
             parts.create_task(self._keep_going())
 
     async def _keep_going(self) -> None:
-        told_at_s = float("-inf")
+        told_at_s, told_lead = float("-inf"), (0, 0)
         while True:
             now_s = self._now_s()
             self._note(self._group.poll(now_s))
             self._review()
-            interval_s = _STATE_TO_NEW_S if self._has_joined else _STATE_INTERVAL_S
-            if self._voted(now_s) or now_s - told_at_s >= interval_s:
-                told_at_s = now_s
+            interval_s = _STATE_TO_NEW_S if self._has_joined else self._state_interval_s()
+            lead = self._group.team, self._group.own_epoch
+            if lead[0] != told_lead[0]:
+                self._log.event("team", f"of drone {lead[0]}" if lead[0] else "of all")
+            if self._voted(now_s) or lead != told_lead or now_s - told_at_s >= interval_s:
+                told_at_s, told_lead = now_s, lead
                 self._has_joined = False
                 self._tell_state()
-            self._sharing.hand_out(now_s)
+            self._sharing.handing.hand_out(now_s)
             self._poll_transfers()
             due_s = self._transfers.next_poll_s()
             pause_s = _STEP_S if due_s is None else min(max(due_s - now_s, 0.001), _STEP_S)
@@ -301,6 +314,18 @@ class Exchange:
             with suppress(TimeoutError):
                 async with asyncio.timeout(pause_s):
                     await self._wake.wait()
+
+    async def _look_around(self) -> None:
+        """Have peers know by a signature, now and then, what place we see."""
+        seen: Frame | None = None
+        while self._group.peers:
+            await asyncio.sleep(_SIGNATURE_S)
+            newest = self._frames.newest
+            if newest is None or newest is seen:
+                continue
+            seen = newest
+            signature = await self._work.signature(np.asarray(newest.image))
+            self._group.note_signature(signature, self._now_s())
 
     def _accept(self, peer: int, message: TunnelPayload, *, to_all: bool) -> None:
         now_s = self._now_s()
@@ -332,16 +357,20 @@ class Exchange:
                 case BlobReceived(peer=peer, kind=BlobKind.FRAME_ANSWER, blob=blob):
                     self._take_frame(peer, blob)
                 case BlobReceived(
-                    peer=peer, kind=(BlobKind.MAP | BlobKind.MAP_UPDATE) as kind, blob=blob
+                    peer=peer,
+                    kind=(BlobKind.MAP | BlobKind.MAP_UPDATE | BlobKind.MAP_PART) as kind,
+                    blob=blob,
                 ):
                     self._sharing.offer(peer, kind, blob)
                 case BlobReceived(peer=peer, kind=BlobKind.POSE_REQUEST, blob=blob):
                     self._inter_host.offer(peer, blob)
                 case BlobReceived(peer=peer, kind=BlobKind.PASSED_FRAME, blob=blob):
                     self._take_passed(peer, blob)
+                case BlobHeld(peer=peer, digest=digest):
+                    self._passed.is_held(peer, digest)
                 case BlobDelivered(peer=peer, transfer_id=transfer_id):
                     self._passed.ended(peer, transfer_id, delivered=True)
-                    self._sharing.delivered(peer, transfer_id, self._now_s())
+                    self._sharing.handing.delivered(peer, transfer_id, self._now_s())
                 case TransferFailed(peer=peer, transfer_id=transfer_id, reason=reason):
                     self._passed.ended(peer, transfer_id, delivered=False)
                     self._log.event("transfer", f"to drone {peer}: {reason}")
@@ -379,9 +408,14 @@ class Exchange:
         except WireError as error:
             self._malformed(peer, "frame", error)
             return
+        if frame.drone_id == peer and not self._group.is_coordinator:
+            self._passed.overheard(frame)
+            return
         refusal = self._rounds.take(peer, frame)
         if refusal is not None:
             self._refusals.count(peer, refusal)
+            return
+        self._passed.answered(frame, describe(BlobKind.FRAME_ANSWER, blob).short_digest)
 
     def _take_passed(self, peer: int, blob: bytes) -> None:
         if self._is_barred(peer, "frame"):
@@ -393,7 +427,7 @@ class Exchange:
 
     def _forgot(self, peer: int) -> None:
         """Note that a peer may have lost what it was sent: it was restarted, or away."""
-        self._sharing.forgot(peer)
+        self._sharing.handing.forgot(peer)
         self._passed.forgot(peer)
 
     def _no_map(self, reason: str) -> None:
@@ -430,14 +464,28 @@ class Exchange:
     def _tell_state(self) -> None:
         stored = self._maps.current
         state = MapState(
-            stored.revision if stored else b"",
+            stored.told_revision if stored else b"",
             stored.n_landmarks if stored else 0,
             self._estimator.is_localized(self._clock.now_ns()),
             min(self._estimator.tracked, MAX_TRACKED),
             self._wants_update,
+            self._group.team,
+            self._group.epoch,
+            world=stored.world if stored and stored.told_revision else b"",
+            signature=self._group.signature_to_tell(self._now_s()),
         )
         self._group.set_own_state(state)
         self._send(state, 0)
+
+    def _state_interval_s(self) -> float:
+        """How long after the last state the next one is told."""
+        told = self._group.state_of(self._system_id)
+        localized = self._estimator.is_localized(self._clock.now_ns())
+        if told is None or told.localized != localized:
+            return _STATE_INTERVAL_S
+        change = abs(self._estimator.tracked - told.tracked)
+        is_news = change > _NEWS_SHARE * max(told.tracked, 1)
+        return _STATE_INTERVAL_S if is_news else _STATE_AT_REST_S
 
     def _poll_transfers(self) -> None:
         outgoing, events = self._transfers.poll(self._now_s())
@@ -445,6 +493,17 @@ class Exchange:
             if self._link is not None:
                 self._link.send(payload.payload_type, payload.payload, payload.peer)
         self._take_events(events)
+
+    def _hand_answer(self, peer: int, blob: bytes) -> tuple[int, ...]:
+        """Send a frame to who has asked for it, and to all others where that costs nothing."""
+        hears = self._group.trusted_teammates if self._transfers.shares_network else ()
+        others = [m for m in hears if m not in (peer, self._system_id) and self._has_map(m)]
+        return tuple(self._hand(BlobKind.FRAME_ANSWER, to, blob) for to in (peer, *others))
+
+    def _has_map(self, peer: int) -> bool:
+        """Whether a peer has a map, or all are about to have a first one."""
+        state = self._group.state_of(peer)
+        return self._maps.current is None or (state is not None and bool(state.revision))
 
     def _send(self, message: Message, peer: int) -> None:
         """Have a message to a peer, or to all (0), go before all that is less urgent."""

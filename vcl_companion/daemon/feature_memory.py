@@ -51,8 +51,9 @@ class FeatureMemory:
         key = (image_bytes, camera.width_px, camera.height_px)
         known = self._known.pop(key, {})
         if detector not in known:
-            found = detect(decode_image(image_bytes, camera), detector, self._options)
-            known[detector] = _compact(found)
+            pyramid = self._pyramids.get(key)
+            image = decode_image(image_bytes, camera) if pyramid is None else pyramid.image
+            known[detector] = _compact(detect(image, detector, self._options))
         self._known[key] = known  # the last one asked for is the last to go
         while len(self._known) > self._n_images:
             del self._known[next(iter(self._known))]

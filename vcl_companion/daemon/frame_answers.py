@@ -71,10 +71,9 @@ class FrameAnswers:
         clocks: whose instants are when.
         log: told of a frame that cannot be sent.
         work: does the encoding.
-        hand: sends an answer to a peer; returns the transfer's id.
+        hand: sends an answer to a peer, and to whoever may hear it too; returns the transfers' ids.
         cancel: ends a transfer, one that is over already too.
         given: told of every frame that is given to a peer.
-        keyframe_quality: of the images, 1 to 100, at most.
         image_bytes: of an image, at most.
     """
 
@@ -89,10 +88,9 @@ class FrameAnswers:
         clocks: PeerClocks,
         log: FlightLog,
         work: MapWork,
-        hand: Callable[[int, bytes], int],
+        hand: Callable[[int, bytes], tuple[int, ...]],
         cancel: Callable[[int], None],
         given: Callable[[FrameAnswer], None],
-        keyframe_quality: int,
         image_bytes: int,
     ) -> None:
         self._system_id = system_id
@@ -107,11 +105,10 @@ class FrameAnswers:
         self._hand = hand
         self._cancel = cancel
         self._note_given = given
-        self._keyframe_quality = keyframe_quality
         self._image_bytes = image_bytes
         self._wanted: PeerMailbox[_Wanted] = PeerMailbox()
         self._given: dict[int, _Given] = {}
-        self._on_its_way: dict[int, int] = {}
+        self._on_its_way: dict[int, tuple[int, ...]] = {}
 
     def want(self, peer: int, request: FrameRequest) -> None:
         """Take a peer's request; a newer one of the same peer replaces it."""
@@ -132,10 +129,10 @@ class FrameAnswers:
                 continue
             if blob is None:
                 continue
-            sent_id = self._hand(peer, blob)
-            if self._on_its_way.get(peer, sent_id) != sent_id:
-                self._cancel(self._on_its_way[peer])  # it wants another one by now
-            self._on_its_way[peer] = sent_id
+            sent = self._hand(peer, blob)
+            for before in set(self._on_its_way.get(peer, ())).difference(sent):
+                self._cancel(before)  # it wants another one by now
+            self._on_its_way[peer] = sent
 
     async def _blob_for(self, peer: int, wanted: _Wanted) -> bytes | None:
         """Return the encoded answer to a request, or None when there is no frame of that instant.
@@ -171,8 +168,8 @@ class FrameAnswers:
         if self._estimator.is_localized(self._clock.now_ns()):
             await self._estimator.looked_at(at_ns, _SETTLE_S)
         state = self._estimator.own_fix_at(at_ns)
-        image_bytes = await self._work.encode(
-            np.asarray(frame.image), self._keyframe_quality, self._image_bytes
+        image_bytes = await self._work.encode_keyframe(
+            np.asarray(frame.image), self._image_bytes, extends=state is not None
         )
         return FrameAnswer(
             drone_id=self._system_id,

@@ -119,7 +119,9 @@ class InterHost:
 
     async def _found(self, request: PoseRequest, came_at_ns: int) -> Proposal | NoProposal:
         stored = self._maps.current
-        if stored is None or stored.revision != request.revision:
+        # While an update goes round its first holders are those who see where the target is:
+        # a revision and the one that it was made from tell of the same world.
+        if stored is None or request.revision not in (stored.revision, stored.parent):
             return NoProposal("the host flies on another map")
         asked = request.frame
         why_not = self._why_not(asked.drone_id)

@@ -81,6 +81,7 @@ class InterTarget:
         cancel: ends a transfer, one that is over already too.
         judged: told of every proposal whether it fits what we know ourselves: the peer, and
             how it does not.
+        carried_in_s: how long our link takes to carry so many bytes to one peer.
         options: how often, how many, how long.
         rng: numbers the requests.
         only_the_surer: whether a localized frame asks only while a peer may know better
@@ -96,6 +97,7 @@ class InterTarget:
         work: MapWork,
         hand: Callable[[int, bytes], int],
         cancel: Callable[[int], None],
+        carried_in_s: Callable[[int], float],
         judged: Callable[[int, str], None],
         options: InterMavOptions,
         rng: np.random.Generator,
@@ -109,6 +111,7 @@ class InterTarget:
         self._only_the_surer = only_the_surer
         self._hand = hand
         self._cancel = cancel
+        self._carried_in_s = carried_in_s
         self.judged = judged
         self._options = options
         self._request_id = int(rng.integers(1 << 32))
@@ -150,7 +153,7 @@ class InterTarget:
             and not self._hosts.may_know_better(revision, sigma_m, at_ns)
         ):
             return None
-        hosts = self._hosts.choose(revision, self._options.max_hosts)
+        hosts = self._hosts.choose(revision, self._n_hosts())
         if not hosts:
             return None
         self._n_since = 0
@@ -161,6 +164,11 @@ class InterTarget:
         self._asked[asked.request_id] = asked
         return asked
 
+    def _n_hosts(self) -> int:
+        """Return how many can be asked so that what they answer is not too old by then."""
+        carried_s = self._carried_in_s(self._options.request_bytes)
+        return max(min(self._options.max_hosts, int(HISTORY_S / carried_s)), 1)
+
     def _is_long_ago(self, at_ns: int) -> bool:
         """Whether the last request was made long enough before an instant."""
         if self._last_at_ns is None:
@@ -168,7 +176,10 @@ class InterTarget:
         return at_ns - self._last_at_ns >= round(1e9 * self._options.least_interval_s)
 
     async def ask(self, asked: Asked) -> list[tuple[int, PoseProposal]]:
-        """Send the request, and wait until all have answered or ``wait_s`` is over.
+        """Send the request, and wait until all have answered or it has been time to.
+
+        ``wait_s`` is for the answers: how long a link takes to carry the request comes on top,
+        as long as what is answered can still be fused.
 
         Returns:
             Host and proposal, the surest first; what comes later, ``stragglers`` has.
@@ -177,7 +188,9 @@ class InterTarget:
         try:
             blob = await self._blob(asked)
             transfers = [self._hand(host, blob) for host in sorted(asked.waiting)]
-            await asked.all_answered(self._options.wait_s)
+            carried_s = len(transfers) * self._carried_in_s(len(blob))
+            most_s = max(self._options.wait_s, HISTORY_S)
+            await asked.all_answered(min(self._options.wait_s + carried_s, most_s))
         except ValueError as error:
             asked.waiting.clear()
             _log.warning("no request for a pose: %s", error)

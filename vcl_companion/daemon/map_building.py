@@ -1,4 +1,7 @@
-"""What a round builds of its frames: a first map, or the next revision; runs beside the loop."""
+"""What a round builds of its frames: a first map, or the next revision; runs beside the loop.
+
+The next revision may also come of another map, of drones that were on their own for a while.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,13 @@ from vcl_companion.geometry.rotation import matrix_from_quaternion
 from vcl_companion.mapping.agreement import contradiction
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.merging import merged
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.reconstruction import reconstruct
 from vcl_companion.mapping.update import extended
 from vcl_companion.vision.features import Features
 from vcl_companion.wire.frame_codec import FrameAnswer
+from vcl_companion.wire.map_codec import decode_map, revision_of
 
 Distances = tuple[tuple[int, int, float], ...]
 
@@ -86,6 +91,36 @@ def update_map(
     # Every member would refuse it.
     why = contradiction(stored.index.landmark_map, stored.index.uncertainty, made)
     return NoMap(f"it contradicts the map in use: {why}") if why else made
+
+
+def merge_maps(
+    stored: StoredMap, data: bytes, map_options: MapOptions, memory: FeatureMemory
+) -> LandmarkMap | NoMap:
+    """Build the next revision of a map of it and another one; takes some seconds.
+
+    Args:
+        stored: the map in use, whose world is kept.
+        data: the other one, encoded, the whole of it.
+        map_options: thresholds.
+        memory: finds features.
+
+    Returns:
+        A map whose parent is ``stored`` and which names the other one as joined, or
+        why there is none.
+
+    Raises:
+        WireError: the bytes are no map.
+    """
+    return merged(
+        stored.index.landmark_map,
+        stored.revision,
+        decode_map(data),
+        revision_of(data),
+        memory.features,
+        map_options,
+        pyramid_of=memory.pyramid,
+        sure=stored.index.uncertainty,
+    )
 
 
 def _view(frame: FrameAnswer, map_options: MapOptions, memory: FeatureMemory) -> DroneView | NoMap:

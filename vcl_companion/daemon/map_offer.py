@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.localization.map_index import MapIndex, index_map
-from vcl_companion.mapping.agreement import contradiction, have_common_keyframes
+from vcl_companion.mapping.agreement import contradiction, have_common_keyframes, moved_to
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.mapping.uncertainty import MapUncertainty
 from vcl_companion.vision.features import Detector, FeatureOptions, Features
 from vcl_companion.wire.header import BlobKind
 from vcl_companion.wire.map_codec import decode_map, parent_of, revision_of
+from vcl_companion.wire.map_part import decode_map_part
 from vcl_companion.wire.map_update import decode_map_update, encode_map_update, names_of_update
 
 
@@ -28,6 +29,7 @@ class MapOffer:
         revision: what it calls itself; proven when it is read.
         parent: what it was made from; empty for a first map.
         update: the same for one who has its parent, if that is encoded already.
+        part_of: of a part, the revision of the whole map; empty for a whole one.
     """
 
     kind: BlobKind
@@ -35,6 +37,7 @@ class MapOffer:
     revision: bytes
     parent: bytes
     update: bytes = b""
+    part_of: bytes = b""
 
     @classmethod
     def of(cls, kind: BlobKind, blob: bytes) -> MapOffer:
@@ -45,6 +48,9 @@ class MapOffer:
         """
         if kind == BlobKind.MAP_UPDATE:
             return cls(kind, blob, *names_of_update(blob))
+        if kind == BlobKind.MAP_PART:
+            whole, data = decode_map_part(blob)
+            return cls(kind, blob, revision_of(data), parent_of(data), part_of=whole)
         return cls(kind, blob, revision_of(blob), parent_of(blob))
 
 
@@ -64,6 +70,7 @@ class ReadyMap:
 
     Attributes:
         contradicts: how it contradicts the map in use; empty when it does not.
+        part_of: see ``StoredMap``.
     """
 
     data: bytes
@@ -71,10 +78,18 @@ class ReadyMap:
     update: bytes
     templates: Templates | None
     contradicts: str = ""
+    part_of: bytes = b""
 
     def stored(self) -> StoredMap:
         """Return it as it is held while it is in use."""
-        return StoredMap(revision_of(self.data), self.data, self.index, self.update, self.templates)
+        return StoredMap(
+            revision_of(self.data),
+            self.data,
+            self.index,
+            self.update,
+            self.templates,
+            self.part_of,
+        )
 
 
 def ready_map(
@@ -102,27 +117,38 @@ def ready_map(
             an image that is not.
         ValueError: an image cannot be used, or the map is not determined.
     """
-    has_parent = current is not None and current.revision == offer.parent
+    # To a part comes what any revision of its line has beyond it.
+    has_parent = current is not None and (current.revision == offer.parent or current.part_of)
     parent = current.index.landmark_map if current is not None and has_parent else None
     if offer.kind == BlobKind.MAP:
         data = offer.blob
-    elif parent is None:
+    elif offer.kind == BlobKind.MAP_PART:
+        data = decode_map_part(offer.blob)[1]
+    elif parent is None and not (current is None and offer.parent == b""):
         raise ValueError("an update of a map that is not in use here")
     else:
         data = decode_map_update(offer.blob, parent, held)
 
     index = _indexed(decode_map(data), detector, features, memory)
     update = offer.update
-    if parent is not None and not update:
-        update = encode_map_update(data, parent)
+    if current is not None and current.revision == offer.parent and not update:
+        update = encode_map_update(data, current.index.landmark_map)
     templates = prepare_templates(index.landmark_map, index.uncertainty) if tracked else None
-    contradicts = "" if current is None else _contradiction(current, index.landmark_map)
-    return ReadyMap(data, index, update, templates, contradicts)
+    contradicts = "" if current is None else _contradiction(current, index.landmark_map, data)
+    return ReadyMap(data, index, update, templates, contradicts, offer.part_of)
 
 
-def _contradiction(current: StoredMap, landmark_map: LandmarkMap) -> str:
-    """Say how a map contradicts the one in use; empty if it does not."""
+def _contradiction(current: StoredMap, landmark_map: LandmarkMap, data: bytes) -> str:
+    """Say how a map contradicts the one in use; empty if it does not.
+
+    One of another world that ours was joined with is compared in ours. Where it was not, and
+    they have keyframes in common all the same, they are of one world by different names.
+    """
     own = current.index.landmark_map
+    if landmark_map.world_of(revision_of(data)) != current.world:
+        ways = [joined for joined in landmark_map.joined if joined.world == current.world]
+        if ways:
+            landmark_map = moved_to(landmark_map, ways[-1].world_from_other.inverse())
     if landmark_map.parent == current.revision and not have_common_keyframes(own, landmark_map):
         return "made from ours, it has none of its keyframes"
     return contradiction(own, current.index.uncertainty, landmark_map)

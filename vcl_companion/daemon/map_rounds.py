@@ -114,7 +114,7 @@ class MapRounds:
         """Take a peer's frame; return why it is refused, if it is."""
         refusal = self._gathering.take(peer, frame)
         if refusal is None and self._is_updating:
-            self._passed.pass_on(frame)
+            self._passed.pass_on_answer(frame)
         return refusal
 
     async def run(self) -> None:
@@ -165,18 +165,19 @@ class MapRounds:
         return waited < (_MAX_DELIVERIES if self._is_receiving_map() else 1.0)
 
     async def _first_map(self, frame: Frame) -> None:
-        leader = self._group.leader
         request_id = self._gathering.begin()
         group = self._group
-        # Without the leader there is no world, without a known distance no scale.
+        # The leader's body is the world's origin, ours where there is none; without a known
+        # distance there is no scale.
+        origin = group.leader if group.leader in group.teammates else group.own_id
         contributors = group.contributors(
-            (group.leader, *group.measured), self._options.update.contributors
+            (origin, *group.measured), self._options.update.contributors
         )
         wanted = Wanted(
             frame.captured_at_ns, contributors, timeout_s=self._options.map.gather_timeout_s
         )
         frames = await self._gathered(frame, wanted, self._has_map)
-        built = await self._built(frames, lambda frames: self._work.first_map(frames, leader))
+        built = await self._built(frames, lambda frames: self._work.first_map(frames, origin))
         if not self._has_map():
             await self._decide(built, None, request_id)
 

@@ -32,6 +32,7 @@ class StoredMap:
         update: the same for one who has its parent (``map_update``); empty when
             we do not have that ourselves.
         templates: ready to be tracked; None when it is not to be.
+        part_of: the revision that this is a part of (``map_part``); empty for a whole map.
     """
 
     revision: bytes
@@ -39,11 +40,26 @@ class StoredMap:
     index: MapIndex
     update: bytes = b""
     templates: Templates | None = None
+    part_of: bytes = b""
+
+    @property
+    def told_revision(self) -> bytes:
+        """What peers are told that we have: nothing yet, of a part."""
+        return b"" if self.part_of else self.revision
 
     @property
     def parent(self) -> bytes:
         """The revision that it was made from; empty for a first map."""
         return self.index.landmark_map.parent
+
+    @property
+    def world(self) -> bytes:
+        """The frame that it is in."""
+        return self.index.landmark_map.world_of(self.revision)
+
+    def has_in_it(self, revision: bytes) -> bool:
+        """Whether another map was merged into it, or into one that it was made from."""
+        return any(other.revision == revision for other in self.index.landmark_map.joined)
 
     @property
     def n_landmarks(self) -> int:
@@ -87,9 +103,10 @@ class MapStore:
         index: MapIndex,
         update: bytes = b"",
         templates: Templates | None = None,
+        part_of: bytes = b"",
     ) -> StoredMap:
         """Fly on this map from the next frame on."""
-        stored = StoredMap(revision_of(data), data, index, update, templates)
+        stored = StoredMap(revision_of(data), data, index, update, templates, part_of)
         if self.current is not None and self.current.revision != stored.revision:
             self._left.append(self.current.revision)
         self.current = stored

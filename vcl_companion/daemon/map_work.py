@@ -53,6 +53,16 @@ class MapWork:
         data: bytes = await self._do(_IMAGES, "encode", image, quality, most_bytes)
         return data
 
+    async def encode_keyframe(self, image: Image, most_bytes: int, *, extends: bool) -> bytes:
+        """See ``Workshop``."""
+        data: bytes = await self._do(_IMAGES, "encode_keyframe", image, most_bytes, extends)
+        return data
+
+    async def signature(self, image: Image) -> bytes:
+        """See ``Workshop``."""
+        signature: bytes = await self._do(_PEERS, "signature", image)
+        return signature
+
     async def look_at(self, frame: FrameAnswer) -> None:
         """See ``Workshop``."""
         await self._do(_MAPS, "look_at", frame)
@@ -71,11 +81,28 @@ class MapWork:
         )
         return built
 
+    async def merged(self, stored: StoredMap, data: bytes) -> LandmarkMap | NoMap:
+        """See ``Workshop``."""
+        built: LandmarkMap | NoMap = await self._do_with(
+            stored, _MAPS, "merged", stored.revision, data
+        )
+        return built
+
     async def encoded(self, built: LandmarkMap, parent: StoredMap | None) -> HandOut:
         """See ``Workshop``."""
         name = b"" if parent is None else parent.revision
         encoded: HandOut = await self._do_with(parent, _MAPS, "encoded", built, name)
         return encoded
+
+    async def part(self, stored: StoredMap, most_bytes: int) -> bytes:
+        """See ``Workshop``."""
+        part: bytes = await self._do_with(stored, _PEERS, "part", stored.revision, most_bytes)
+        return part
+
+    async def rest(self, stored: StoredMap, part: bytes) -> bytes:
+        """See ``Workshop``."""
+        rest: bytes = await self._do_with(stored, _PEERS, "rest", stored.revision, part)
+        return rest
 
     async def ready(
         self, offer: MapOffer, current: StoredMap | None, held: Mapping[bytes, bytes]

@@ -1,8 +1,9 @@
 """The frames of a round at those who did not take them, while the map is still being built.
 
-Images are most of an update's bytes, and known before it is. Passed on by the
-coordinator as they come, they are with everybody when the map is made: what has to
-wait for that, poses and landmarks, is a third.
+Images are most of an update's bytes, and known before it is. Where all hear what one sends,
+a member's answer goes to all of them; else the coordinator passes it on as it comes, as it
+does with its own. They are with everybody when the map is made: what has to wait for that,
+poses and landmarks, is a third.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ _log = logging.getLogger(__name__)
 
 # Forty kilobytes each; and what a sender takes a peer to hold, which has its own among them.
 _N_HELD, _N_KNOWN_HELD = 48, 40
+# What was said of blobs that are not here, or not yet.
+_N_SAID = 256
 
 
 @dataclass
@@ -42,6 +45,7 @@ class PassedFrames:
         hand: sends a frame to a peer; returns the transfer's id.
         cancel: ends a transfer, one that is over already too.
         work: finds the features of what has come: a map with this image will need them.
+        all_hear: whether members' answers go to everybody.
     """
 
     def __init__(
@@ -50,13 +54,17 @@ class PassedFrames:
         hand: Callable[[int, bytes], int],
         cancel: Callable[[int], None],
         work: MapWork,
+        all_hear: Callable[[], bool],
     ) -> None:
         self._group = group
         self._hand = hand
         self._cancel = cancel
+        self._all_hear = all_hear
         self._work = work
         self._peers: dict[int, _AtPeer] = {}
         self._held: dict[bytes, bytes] = {}
+        self._names: dict[bytes, bytes] = {}  # of the images of answers, by their blobs' digests
+        self._said: deque[tuple[int, bytes]] = deque(maxlen=_N_SAID)
         self._new: asyncio.Queue[FrameAnswer] = asyncio.Queue(_N_HELD)
 
     @property
@@ -88,6 +96,29 @@ class PassedFrames:
         self._keep(frame.image_bytes)
         self._look_at(frame)
 
+    def overheard(self, frame: FrameAnswer) -> None:
+        """Hold the image of a frame that a member has given to the coordinator."""
+        self._keep(frame.image_bytes)
+        self._look_at(frame)
+
+    def answered(self, frame: FrameAnswer, digest: bytes) -> None:
+        """Note what a member has given to us, and perhaps to others, in a blob."""
+        self._names[digest] = name = name_of_image(frame.image_bytes)
+        self._peers.setdefault(frame.drone_id, _AtPeer()).held.append(name)
+        while len(self._names) > _N_HELD:
+            del self._names[next(iter(self._names))]
+        said, self._said = self._said, deque(maxlen=_N_SAID)
+        for peer, other in said:
+            self.is_held(peer, other)
+
+    def is_held(self, peer: int, digest: bytes) -> None:
+        """Note that a peer says to have a blob whole."""
+        name = self._names.get(digest)
+        if name is None:
+            self._said.append((peer, digest))
+        else:
+            self._peers.setdefault(peer, _AtPeer()).held.append(name)
+
     async def run(self) -> None:
         """Find the features of what goes round, before the map needs them, until cancelled."""
         while True:
@@ -100,17 +131,25 @@ class PassedFrames:
                 # A peer's image went in: it may not end the flight.
                 _log.exception("a frame of drone %d cannot be looked at", frame.drone_id)
 
+    def pass_on_answer(self, frame: FrameAnswer) -> None:
+        """Pass a member's frame on, unless all have heard it."""
+        if not self._all_hear():
+            self.pass_on(frame)
+
     def pass_on(self, frame: FrameAnswer) -> None:
         """Send a frame of a round to every member that neither took it nor coordinates."""
         self._look_at(frame)
         name = name_of_image(frame.image_bytes)
         blob = b""
-        for peer in self._group.alive:
+        for peer in self._group.teammates:
             if peer == self._group.own_id:
                 continue
             there = self._peers.setdefault(peer, _AtPeer())
+            state = self._group.state_of(peer)
             if peer == frame.drone_id:
                 there.held.append(name)
+            elif state is not None and not state.revision:
+                continue  # it has no map that an update could be of: that comes first
             elif name not in there.held and name not in there.on_their_way.values():
                 blob = blob or encode_frame(frame, BlobKind.PASSED_FRAME)
                 there.on_their_way[self._hand(peer, blob)] = name
@@ -135,6 +174,7 @@ class PassedFrames:
     def forgot(self, peer: int) -> None:
         """Note that a peer may hold nothing any more: it was restarted, or away."""
         self._stop(self._peers.pop(peer, None))
+        self._said = deque((one for one in self._said if one[0] != peer), _N_SAID)
 
     def over(self) -> None:
         """Stop what is on its way, and forget who holds what: there is no map that needs it."""

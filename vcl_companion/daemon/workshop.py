@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.feature_memory import FeatureMemory
-from vcl_companion.daemon.map_building import Distances, build_map, update_map
+from vcl_companion.daemon.map_building import Distances, build_map, merge_maps, update_map
 from vcl_companion.daemon.map_offer import HandOut, MapOffer, ReadyMap, ready_map, with_fallbacks
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.peer_look import PeerLook
@@ -22,18 +22,24 @@ from vcl_companion.localization.intra import Localized, NotLocalized, Prior
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pipeline import Effort, PipelineOptions, localize
 from vcl_companion.localization.pose_filter import FilterState
+from vcl_companion.mapping.continuity import newest_part
 from vcl_companion.mapping.drone_view import encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.pose_requests import InterMavOptions
-from vcl_companion.vision.features import Detector, Image
+from vcl_companion.vision.features import Detector, FeatureOptions, Image, detect
+from vcl_companion.vision.focus import focused
+from vcl_companion.vision.signature import signature_of
 from vcl_companion.wire.frame_codec import FrameAnswer
-from vcl_companion.wire.map_codec import encode_map, revision_of
+from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
+from vcl_companion.wire.map_part import decode_map_part, encode_map_part
 from vcl_companion.wire.map_update import encode_map_update
 
 # The one in use, and the next one.
 _N_MAPS = 2
+# Less of a map would not tell where one is.
+_LEAST_KEYFRAMES, _LEAST_LANDMARKS = 2, 100
 
 
 class NotHereError(Exception):
@@ -87,16 +93,37 @@ class Workshop:
             del self._maps[next(iter(self._maps))]
 
     def encode(self, image: Image, quality: int, most_bytes: int) -> bytes:
-        """Return one of our frames as peers get it; see ``encode_image``."""
+        """Return one of our frames as a host gets it, to say where it was; see ``encode_image``."""
         return encode_image(image, quality, most_bytes)
 
+    def encode_keyframe(self, image: Image, most_bytes: int, extends: bool) -> bytes:
+        """Return one of our frames as all get it, for a map; see ``encode_image``.
+
+        Args:
+            image: (H, W) uint8.
+            most_bytes: at most, if that can be.
+            extends: whether a map is followed in it, which it may become a keyframe of. Else
+                it has to be recognised, perhaps from far away, and all of it is of use.
+        """
+        options = self._options.map
+        if extends and options.patches:
+            strongest = FeatureOptions(max_features=options.update_features)
+            corners = detect(image, self._options.detectors[0], strongest).pixels
+            image = focused(image, corners)
+        return encode_image(image, options.keyframe_quality, most_bytes)
+
+    def signature(self, image: Image) -> bytes:
+        """Return what tells peers the place that an image shows; see ``signature_of``."""
+        return signature_of(image)
+
     def look_at(self, frame: FrameAnswer) -> None:
-        """Find the features of a frame that a map will be made of, before it is.
+        """Decode a frame that a map will be made of, and find its features, before it is.
 
         Raises:
             ValueError: its image cannot be used.
         """
         detector = self._options.detectors[0]
+        self._memory.pyramid(frame.image_bytes, frame.camera)
         self._memory.features(frame.image_bytes, frame.camera, detector)
 
     def first_map(self, frames: list[FrameAnswer], leader: int) -> LandmarkMap | NoMap:
@@ -111,17 +138,52 @@ class Workshop:
         stored = self._named(revision)
         return update_map(stored, frames, self._options.map, self._memory, at_once=at_once)
 
+    def merged(self, revision: bytes, data: bytes) -> LandmarkMap | NoMap:
+        """Build the next revision of a map of it and another, encoded one; see ``merge_maps``.
+
+        Raises:
+            WireError: the bytes are no map.
+        """
+        built = merge_maps(self._named(revision), data, self._options.map, self._memory)
+        give_back_freed()
+        return built
+
     def encoded(self, built: LandmarkMap, parent: bytes) -> HandOut:
-        """Return a map as peers get it, and for those who have its parent (empty: nobody).
+        """Return a map as peers get it, whole and for those who have its parent (empty: none).
 
         Raises:
             ValueError: the map breaks a bound that peers hold every map to.
         """
         data = encode_map(built)
-        update = b""
-        if parent:
-            update = encode_map_update(data, self._named(parent).index.landmark_map)
+        before = self._named(parent).index.landmark_map if parent else None
+        update = encode_map_update(data, before)
         return HandOut(revision_of(data), built.parent, data, update)
+
+    def part(self, revision: bytes, most_bytes: int) -> bytes:
+        """Return the longest encoded part of a map (``map_part``) within bounds; empty for none.
+
+        Args:
+            revision: the map's.
+            most_bytes: how long a part may be.
+        """
+        whole = self._named(revision).index.landmark_map
+        for n_keyframes in range(len(whole.keyframes) - 1, _LEAST_KEYFRAMES - 1, -1):
+            images = whole.keyframes[-n_keyframes:]
+            if sum(len(keyframe.image_bytes) for keyframe in images) > most_bytes:
+                continue
+            try:
+                part = newest_part(whole, n_keyframes)
+            except ValueError:
+                continue  # these do not hang together
+            blob = encode_map_part(revision, encode_map(part))
+            if len(blob) <= most_bytes and len(part.points_world) >= _LEAST_LANDMARKS:
+                return blob
+        return b""
+
+    def rest(self, revision: bytes, part: bytes) -> bytes:
+        """Return what a map has beyond an encoded part of it or of an earlier revision."""
+        of = decode_map(decode_map_part(part)[1])
+        return encode_map_update(self._named(revision).data, of)
 
     def ready(self, offer: MapOffer, current: bytes, held: Mapping[bytes, bytes]) -> ReadyMap:
         """Make a map ready to be flown on, and keep it; see ``ready_map``.

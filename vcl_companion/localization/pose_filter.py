@@ -19,6 +19,7 @@ import numpy as np
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, log_so3
+from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.localization.covariance_intersection import intersect, unlikeness
 from vcl_companion.localization.intra import Localized, NotLocalized, Prior
 
@@ -168,6 +169,27 @@ def started_from_proposal(
     fix = Localized(world_from_body, covariance, nothing, np.zeros((6, 0)), np.zeros((0, 0)),
                     0, 0, False, 0.0)  # fmt: skip
     return started(fix, at_ns, ned_from_body, options)
+
+
+def carried(state: FilterState, other_from_world: Similarity) -> FilterState:
+    """Return a state as it is in another world, whose map it goes on with.
+
+    The error of the map that it was begun on is kept; how well the two maps are joined is
+    part of the other map's own error.
+    """
+    turn, scale = other_from_world.rotation, other_from_world.scale
+    moving = np.eye(len(state.covariance))
+    moving[_P, _P] = moving[_V, _V] = scale * turn
+    moving[_B, _B] = turn
+    stretching = np.diag([scale] * 3 + [1.0] * 3)
+    return replace(
+        state,
+        world_from_body=other_from_world.of_pose(state.world_from_body),
+        velocity_world=scale * turn @ state.velocity_world,
+        world_from_ned=turn @ state.world_from_ned,
+        covariance=moving @ state.covariance @ moving.T,
+        own_map_covariance=stretching @ state.own_map_covariance @ stretching,
+    )
 
 
 def predict(

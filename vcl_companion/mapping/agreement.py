@@ -8,9 +8,12 @@ its own accuracy does not count.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.uncertainty import MapUncertainty
 
@@ -50,6 +53,22 @@ def contradiction(old: LandmarkMap, sure: MapUncertainty, new: LandmarkMap) -> s
         _moved_keyframes(old, sure, new, places, reach_m)
         or _moved_distances(old, new, places)
         or _moved_landmarks(old, sure, new, places, reach_m)
+    )
+
+
+def moved_to(landmark_map: LandmarkMap, other_from_world: Similarity) -> LandmarkMap:
+    """Return a map as it is in another world, to be compared with one of that."""
+    return replace(
+        landmark_map,
+        keyframes=tuple(
+            replace(k, world_from_body=other_from_world.of_pose(k.world_from_body))
+            for k in landmark_map.keyframes
+        ),
+        points_world=other_from_world.apply(landmark_map.points_world),
+        distances=tuple(
+            replace(d, distance_m=other_from_world.scale * d.distance_m)
+            for d in landmark_map.distances
+        ),
     )
 
 

@@ -90,6 +90,22 @@ def pruned(landmark_map: LandmarkMap, n_old: int, options: MapOptions) -> Landma
     return landmark_map
 
 
+def newest_part(whole: LandmarkMap, n_keyframes: int) -> LandmarkMap:
+    """Return what the newest keyframes of a map show: a map in the same frame, of the same scale.
+
+    Raises:
+        ValueError: the map's observations do not fix it, or the part's own do not.
+    """
+    n_gone = len(whole.keyframes) - n_keyframes
+    part = whole
+    for _ in range(n_gone):
+        part = _without(part, 0)
+    if n_gone > 0:
+        part = _anchored_anew(part, whole, list(range(n_gone, len(whole.keyframes))))
+        map_uncertainty(part)
+    return part
+
+
 def _least_missed(landmark_map: LandmarkMap, worth: Array) -> int:
     """Return the keyframe worth least of those without which the others hang together as before.
 

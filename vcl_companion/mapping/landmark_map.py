@@ -14,7 +14,13 @@ import numpy as np
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.vision.information import is_covariance
+
+# A revision, and with it a world, is named by so many bytes.
+NAME_BYTES = 8
+# Of the maps that were merged into one the newest are remembered.
+MAX_JOINED = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +55,26 @@ class KnownDistance:
 
 
 @dataclass(frozen=True, eq=False)
+class JoinedMap:
+    """A map that was merged into another one, or into one that this was made from.
+
+    Attributes:
+        revision: of the map.
+        world: that it was in: the revision of the first map of its line.
+        world_from_other: takes that world to the one of the map that this is a part of.
+    """
+
+    revision: bytes
+    world: bytes
+    world_from_other: Similarity
+
+    def __post_init__(self) -> None:
+        for name in ("revision", "world"):
+            if len(getattr(self, name)) != NAME_BYTES:
+                raise ValueError(f"JoinedMap.{name} must have {NAME_BYTES} bytes")
+
+
+@dataclass(frozen=True, eq=False)
 class LandmarkMap:
     """One immutable revision of the shared map.
 
@@ -64,6 +90,10 @@ class LandmarkMap:
         parent: revision this one was made from; empty for a first map.
         anchor_covariance: (6, 6) local, m and rad, of the first keyframe in the world: none
             at the start, later what was known of its successor when it took its place.
+        world: the frame that it is in: the revision of the first map of its line; empty for
+            a first map, whose world is its own revision (``world_of``).
+        joined: the maps that were merged into this one or one that it was made from, the
+            newest last.
     """
 
     keyframes: tuple[Keyframe, ...]
@@ -74,6 +104,8 @@ class LandmarkMap:
     distances: tuple[KnownDistance, ...]
     parent: bytes
     anchor_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    world: bytes = b""
+    joined: tuple[JoinedMap, ...] = ()
 
     def __post_init__(self) -> None:
         n, v = len(self.points_world), len(self.keyframes)
@@ -97,6 +129,16 @@ class LandmarkMap:
         for distance in self.distances:
             if not (0 <= distance.keyframe_a < v and 0 <= distance.keyframe_b < v):
                 raise ValueError(f"LandmarkMap: a known distance names no keyframe: {distance}")
+        if len(self.world) not in (0, NAME_BYTES) or (self.world and not self.parent):
+            raise ValueError(f"LandmarkMap.world is none of a map of parent {self.parent!r}")
+        if len(self.joined) > MAX_JOINED or (self.joined and not self.world):
+            raise ValueError(
+                f"LandmarkMap: {len(self.joined)} maps cannot have been merged into it"
+            )
+
+    def world_of(self, revision: bytes) -> bytes:
+        """Return the name of the world that the map is in, given its own revision."""
+        return self.world or revision
 
     @property
     def seen(self) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:

@@ -7,13 +7,12 @@ each weighed by its own uncertainty.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, exp_so3, orthonormalized
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.joining import Joined, contradiction, sightings_of
 from vcl_companion.mapping.landmark_map import LandmarkMap
@@ -33,31 +32,6 @@ _SEARCH_PX = 12.0
 # 99.9 % of a two-dimensional Gaussian.
 _CHI2_2_999 = 13.8
 _SINGULAR = 1e-10
-
-
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """The transform that takes a scene of unknown scale to the world."""
-
-    scale: float
-    rotation: Array
-    translation: Array
-
-    def apply(self, points: Array) -> Array:
-        """Return (..., 3) points of the scene in the world, m."""
-        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
-
-    def pose(self, scene_from_cam: Pose) -> Pose:
-        """Return world_from_cam."""
-        return Pose(self.rotation @ scene_from_cam.rotation, self.apply(scene_from_cam.translation))
-
-    def moved(self, delta: Array) -> Similarity:
-        """Return it perturbed by (7,): rotation vector, translation, logarithm of the scale."""
-        return Similarity(
-            self.scale * float(np.exp(delta[6])),
-            self.rotation @ exp_so3(delta[:3]),
-            self.translation + delta[3:6],
-        )
 
 
 def join_together(
@@ -126,7 +100,7 @@ def _placed(
         return NoMap(f"its {len(used)} views together know their scale to {100 * vague:.0f} % only")
     joined = {}
     for i in used:
-        body = found.pose(scene.cams[i]) @ views[i].body_from_cam.inverse()
+        body = found.of_pose(scene.cams[i]) @ views[i].body_from_cam.inverse()
         reason = contradiction(views[i], body, options)
         if reason:
             return NoMap(reason)
@@ -162,9 +136,9 @@ def _searched(
     best, most = None, 5
     for _ in range(_SAMPLES):
         three = rng.choice(len(pairs), 3, replace=False)
-        guess = _from_points(in_scene[three], in_world[three])
+        guess = Similarity.of_points(in_scene[three], in_world[three])
         if guess is None or any(
-            contradiction(views[i], guess.pose(cam) @ views[i].body_from_cam.inverse(), options)
+            contradiction(views[i], guess.of_pose(cam) @ views[i].body_from_cam.inverse(), options)
             for i, cam in scene.cams.items()
         ):
             continue
@@ -175,21 +149,6 @@ def _searched(
         if agree > most:
             best, most = guess, agree
     return best
-
-
-def _from_points(scene: Array, world: Array) -> Similarity | None:
-    """Return the similarity of (N, 3) points to (N, 3) others (Umeyama 1991); None if flat."""
-    a, b = scene - scene.mean(axis=0), world - world.mean(axis=0)
-    u, sizes, vt = np.linalg.svd(b.T @ a)
-    spread = float((a**2).sum())
-    if not sizes[1] > 1e-9 * max(float(sizes[0]), 1e-12):
-        return None
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = orthonormalized((u * sign) @ vt)
-    scale = float((sizes * sign).sum()) / spread
-    if not scale > 0.0:
-        return None
-    return Similarity(scale, rotation, world.mean(axis=0) - scale * rotation @ scene.mean(axis=0))
 
 
 def _refined(
@@ -226,7 +185,7 @@ def _linearized(
     found: Similarity, scene: Scene, i: int, sightings: Sightings
 ) -> tuple[Array, Array, Array]:
     """Return (M, 2) residuals of one view, (M, 2, 7) by the similarity, (M, 2, 3) by the point."""
-    world_from_cam = found.pose(scene.cams[i])
+    world_from_cam = found.of_pose(scene.cams[i])
     residual, by_pose, by_point = linearized(
         world_from_cam, Pose.identity(), sightings.slopes, sightings.points, sightings.ideal
     )

@@ -15,6 +15,8 @@ class MapOptions:
         detectors: features that the map is made of; SIFT makes the better geometry
             from far apart, and those of the localization must be among them.
         keyframe_quality: WebP quality of exchanged images, 1 to 100.
+        update_features: images that extend a map keep their detail around so many of their
+            strongest features and are blurred elsewhere (``vision.focus``).
         min_landmarks: fewer are refused.
         min_angle_deg: landmarks seen under a smaller angle are left out.
         max_error_px: observations that miss by more are left out.
@@ -33,6 +35,7 @@ class MapOptions:
 
     detectors: tuple[Detector, ...] = ("akaze", "sift")
     keyframe_quality: int = 80
+    update_features: int = 1000
     min_landmarks: int = 60
     min_angle_deg: float = 1.0
     max_error_px: float = 2.5
@@ -50,6 +53,8 @@ class MapOptions:
     def __post_init__(self) -> None:
         if not 1 <= self.keyframe_quality <= 100:
             raise ValueError(f"keyframe_quality must lie in 1..100, got {self.keyframe_quality}")
+        if not 100 <= self.update_features <= 20_000:
+            raise ValueError(f"update_features must lie in 100..20000, got {self.update_features}")
         if self.min_landmarks < 20:
             raise ValueError(f"min_landmarks must be at least 20, got {self.min_landmarks}")
         if self.landmarks_per_cell < 1:

@@ -105,7 +105,10 @@ def extended(
     if reason:
         return NoMap(reason)
     try:
-        made = pruned(replace(growth.landmark_map, parent=parent), len(old.keyframes), options)
+        child = replace(
+            growth.landmark_map, parent=parent, world=old.world_of(parent), joined=old.joined
+        )
+        made = pruned(child, len(old.keyframes), options)
     except ValueError as error:
         return NoMap(str(error))
     return accepted(made, options)

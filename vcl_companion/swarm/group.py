@@ -1,10 +1,16 @@
 """Who is in the group, who is alive, who coordinates, who has which map, who wants it updated.
 
 The leader is named by the configuration (the lowest member id unless it says
-otherwise): its body at the first map is the world's origin. The coordinator is
-the leader, or, once the leader was heard and then lost, the lowest member
-alive. A leader never heard is waited for: at a start drones come up seconds
-apart, and each must not begin a map of its own.
+otherwise): its body at the first map is the world's origin. The coordinator of a
+team (``teams``) is the leader, where it flies with that, or, once the leader was
+heard and then lost, the lowest member alive that is believed. A leader never
+heard is waited for, but not for ever: at a start drones come up seconds apart, and
+each must not begin a map of its own.
+
+Whoever begins to coordinate takes an epoch (``epochs``); one who does it under an
+older one, for it was away, is not followed until it has taken a newer one. A drone
+that was restarted waits for the time-out before it holds anybody for lost that
+it has not heard itself: until then it knows neither who is there nor the epochs.
 """
 
 from __future__ import annotations
@@ -14,50 +20,17 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from vcl_companion.errors import ConfigError
+from vcl_companion.swarm.epochs import FIRST, VACANT, Epochs
+from vcl_companion.swarm.overlap import OverlapGraph, OverlapOptions
+from vcl_companion.swarm.swarm_options import SwarmOptions
+from vcl_companion.swarm.teams import Meetings, Parting, Roster, team_with_a_map
 from vcl_companion.wire.messages import MapState
 
-_MAX_MEMBER_ID = 250
+__all__ = ["Group", "GroupEvent", "PeerJoined", "PeerLost", "SwarmOptions"]
 
-
-@dataclass(frozen=True)
-class SwarmOptions:
-    """The group as it is configured, the same on every drone.
-
-    Attributes:
-        members: system ids of all drones; empty for a drone alone.
-        leader: one of them; 0 for the lowest.
-        known_distances: (a, b, m): distance between two drones at the start, m.
-        heartbeat_timeout_s: silent for this long is lost.
-    """
-
-    members: tuple[int, ...] = ()
-    leader: int = 0
-    known_distances: tuple[tuple[int, int, float], ...] = ()
-    heartbeat_timeout_s: float = 5.0
-
-    def __post_init__(self) -> None:
-        for member in self.members:
-            if not 1 <= member <= _MAX_MEMBER_ID:
-                raise ConfigError(f"members: {member} is not a system id of 1 to {_MAX_MEMBER_ID}")
-        if len(set(self.members)) != len(self.members):
-            raise ConfigError(f"members: {list(self.members)} names a drone twice")
-        if self.leader and self.leader not in self.members:
-            raise ConfigError(f"leader: {self.leader} is not one of members {list(self.members)}")
-        if not (math.isfinite(self.heartbeat_timeout_s) and self.heartbeat_timeout_s > 0):
-            raise ConfigError(f"heartbeat_timeout_s: {self.heartbeat_timeout_s} is not positive")
-        pairs: set[frozenset[int]] = set()
-        for a, b, distance_m in self.known_distances:
-            row = f"known_distances: [{a}, {b}, {distance_m}]"
-            for member in (a, b):
-                if member not in self.members:
-                    raise ConfigError(f"{row}: {member} is not one of {list(self.members)}")
-            if a == b:
-                raise ConfigError(f"{row} is not between two drones")
-            if not (math.isfinite(distance_m) and distance_m > 0):
-                raise ConfigError(f"{row}: a distance must be finite and positive, in metres")
-            if frozenset((a, b)) in pairs:
-                raise ConfigError(f"{row} gives a distance twice")
-            pairs.add(frozenset((a, b)))
+# A signature is told no more often: 48 bytes more each time.
+_SIGNATURE_INTERVAL_S = 2.9
+_SAID_NOTHING = MapState(b"", 0, False)
 
 
 @dataclass(frozen=True)
@@ -78,7 +51,11 @@ GroupEvent = PeerJoined | PeerLost
 
 
 class Group:
-    """What one drone knows of its group; only heartbeats, map states and time change it."""
+    """What one drone knows of its group; only what it is told and time change it.
+
+    Who has which map, who wants another and who coordinates are questions within this drone's
+    team; who is a member, alive, trusted, and whether all are there, are not.
+    """
 
     def __init__(self, options: SwarmOptions, own_id: int) -> None:
         if options.members and own_id not in options.members:
@@ -90,10 +67,20 @@ class Group:
         self.leader = options.leader or self.members[0]
         self.measured = tuple(sorted({m for a, b, _ in options.known_distances for m in (a, b)}))
         self._timeout_s = options.heartbeat_timeout_s
+        self._leader_wait_s = options.leader_wait_s
         self._heard_at_s: dict[int, float] = {}  # members alive
         self._ever_heard: set[int] = set()
         self._states: dict[int, MapState] = {}  # ours, and of members alive
         self._distrusted: frozenset[int] = frozenset()
+        self._team = 0
+        self._epochs = Epochs(own_id)
+        self._graph = OverlapGraph(self.members, OverlapOptions())
+        self._parting = Parting(self._graph, options.split_after_s)
+        self._meetings = Meetings(self._graph, options.rejoin_after_s)
+        self._began_at_s = math.inf
+        self._now_s = -math.inf
+        self._signature = b""
+        self._told_signature_at_s = -math.inf
 
     @property
     def peers(self) -> tuple[int, ...]:
@@ -113,6 +100,7 @@ class Group:
     def distrust(self, peers: frozenset[int]) -> None:
         """Note who is not believed from now on; all others are."""
         self._distrusted = peers - {self.own_id}
+        self._take_term()
 
     @property
     def is_complete(self) -> bool:
@@ -121,9 +109,11 @@ class Group:
 
     @property
     def coordinator(self) -> int:
-        """The member that builds and hands out maps; see the module."""
-        lost = self.leader in self._ever_heard and self.leader not in self._heard_at_s
-        return self.alive[0] if lost else self.leader
+        """The member of our team that builds and hands out maps; see the module."""
+        team = self.teammates
+        if self.leader in team or self._awaits_leader:
+            return self.leader
+        return next(member for member in team if member not in self._distrusted)
 
     @property
     def is_coordinator(self) -> bool:
@@ -136,32 +126,132 @@ class Group:
         state = self._states.get(self.coordinator)
         return state.revision if state else b""
 
+    @property
+    def team(self) -> int:
+        """The team that this drone flies with."""
+        return self._team
+
+    @property
+    def epoch(self) -> int:
+        """The highest epoch known of our team, to be told."""
+        return self._epochs.of(self._team)
+
+    @property
+    def own_epoch(self) -> int:
+        """What this drone coordinates under; 0 where it does not, or is the leader from the start.
+
+        Like the team, a change of it is worth telling at once.
+        """
+        return self.epoch if self.is_coordinator and self._epochs.is_ours(self._team) else FIRST
+
+    @property
+    def teammates(self) -> tuple[int, ...]:
+        """Members alive that fly with our team, this drone among them, ascending."""
+        return tuple(m for m in self.alive if self.team_of(m) == self._team)
+
+    @property
+    def trusted_teammates(self) -> tuple[int, ...]:
+        """Those of them that are believed."""
+        return tuple(m for m in self.teammates if m not in self._distrusted)
+
+    @property
+    def other_teams(self) -> tuple[int, ...]:
+        """The teams that there are but ours, ascending."""
+        return self._roster().other_teams
+
+    @property
+    def teams_met(self) -> tuple[int, ...]:
+        """Other teams that have been seeing what ours sees for ``rejoin_after_s``, ascending."""
+        return self._meetings.lasting(self._now_s)
+
+    def team_of(self, member: int) -> int:
+        """Return the team that a member says it flies with; 0 where it has said nothing."""
+        if member == self.own_id:
+            return self._team
+        state = self._states.get(member)
+        return state.team if state else 0
+
+    def is_senior(self, team: int) -> bool:
+        """Whether another team goes before ours, whose map is merged into that one's then."""
+        return self._roster().is_senior(team, self._team)
+
+    def coordinator_of(self, team: int) -> int | None:
+        """Return who coordinates a team, None where nobody of it is there and believed."""
+        if team == self._team:
+            return self.coordinator
+        members = [m for m in self.alive if self.team_of(m) == team]
+        if self.leader in members:
+            return self.leader
+        return next((m for m in members if m not in self._distrusted), None)
+
+    def join(self, team: int) -> None:
+        """Fly with a team from now on: its map has been taken."""
+        if team != self._team:
+            self._team = team
+            self._take_term()
+
+    def is_fenced(self, peer: int) -> bool:
+        """Whether a peer of our team knows only of an older epoch: its word may be outdated."""
+        state = self._states.get(peer)
+        return (state.epoch if state else FIRST) < self.epoch
+
+    def may_lead(self, peer: int) -> bool:
+        """Whether to take maps of a peer, and do what it asks for, as our coordinator."""
+        return peer == self.coordinator and not (peer != self.own_id and self.is_fenced(peer))
+
     def heartbeat(self, peer: int, now_s: float) -> list[GroupEvent]:
         """Note that a peer is heard; who is no member is ignored."""
+        self._note_time(now_s)
         if peer == self.own_id or peer not in self.members:
             return []
         is_new = peer not in self._heard_at_s
         self._heard_at_s[peer] = max(now_s, self._heard_at_s.get(peer, now_s))
         self._ever_heard.add(peer)
+        if is_new:
+            self._take_term()
         return [PeerJoined(peer)] if is_new else []
 
     def map_state(self, peer: int, state: MapState, now_s: float) -> list[GroupEvent]:
         """Note which map a peer flies on, which is a sign of life too."""
         events = self.heartbeat(peer, now_s)
-        if peer in self._heard_at_s:
-            self._states[peer] = state
+        if peer not in self._heard_at_s:
+            return events
+        before = self._states.get(peer, _SAID_NOTHING)
+        has_moved = peer not in self._distrusted and self._takes_us_along(peer, state)
+        self._states[peer] = state
+        if peer not in self._distrusted:
+            self._epochs.hear(state.team, state.epoch)
+            self._graph.note(peer, state.signature, now_s)
+        if has_moved:
+            self._team = state.team
+        if (state.team, state.epoch) != (before.team, before.epoch):
+            self._take_term()
         return events
 
     def set_own_state(self, state: MapState) -> None:
-        """Note which map this drone flies on."""
+        """Note which map this drone flies on; its team and epoch are known here."""
         self._states[self.own_id] = state
+
+    def note_signature(self, signature: bytes, now_s: float) -> None:
+        """Take the signature of a frame of our own (``vision/signature.py``)."""
+        self._note_time(now_s)
+        self._signature = signature
+        self._graph.note(self.own_id, signature, now_s)
+
+    def signature_to_tell(self, now_s: float) -> bytes:
+        """Return what the next state is to tell: the newest signature, once, and not too often."""
+        if not self._signature or now_s < self._told_signature_at_s + _SIGNATURE_INTERVAL_S:
+            return b""
+        signature, self._signature = self._signature, b""
+        self._told_signature_at_s = now_s
+        return signature
 
     def state_of(self, member: int) -> MapState | None:
         """Return what a member last said of its map; None if nothing, or it is lost."""
         return self._states.get(member)
 
     def contributors(self, first: Iterable[int], most: int) -> tuple[int, ...]:
-        """Return members alive and believed whose frames a map is to be made of, and this drone.
+        """Return teammates that are believed whose frames a map is to be made of, and this drone.
 
         Of many not all: a map would grow, and take bytes and time, with the swarm.
 
@@ -177,27 +267,30 @@ class Group:
             state = self._states.get(member)
             return state.tracked if state is not None else 0
 
-        others = sorted(self.trusted, key=lambda member: (seen(member), member))
+        trusted = self.trusted_teammates
+        others = sorted(trusted, key=lambda member: (seen(member), member))
         order = dict.fromkeys((self.own_id, *first, *others))
-        return tuple(m for m in order if m in self.trusted)[:most]
+        return tuple(m for m in order if m in trusted)[:most]
 
     def holders(self, revision: bytes) -> tuple[int, ...]:
-        """Return the members alive that hold this revision."""
-        return tuple(m for m in self.alive if (s := self._states.get(m)) and s.revision == revision)
+        """Return the teammates that hold this revision."""
+        return tuple(
+            m for m in self.teammates if (s := self._states.get(m)) and s.revision == revision
+        )
 
     def lacking(self) -> tuple[int, ...]:
-        """Return the members trusted that do not hold the newest revision; none without one.
+        """Return the teammates trusted that do not hold the newest revision; none without one.
 
         A member that said nothing of its map yet lacks it.
         """
         if not self.newest_revision:
             return ()
         holders = self.holders(self.newest_revision)
-        return tuple(member for member in self.trusted if member not in holders)
+        return tuple(member for member in self.trusted_teammates if member not in holders)
 
     @property
     def wanting_update(self) -> tuple[int, ...]:
-        """Members trusted whose vote is for an update of the newest revision (IV-G).
+        """Teammates trusted whose vote is for an update of the newest revision (IV-G).
 
         The vote of one that still flies on another revision is about that one,
         and does not count.
@@ -205,25 +298,36 @@ class Group:
         if not self.newest_revision:
             return ()
         holders = self.holders(self.newest_revision)
-        return tuple(m for m in self.trusted if m in holders and self._states[m].wants_update)
+        trusted = self.trusted_teammates
+        return tuple(m for m in trusted if m in holders and self._states[m].wants_update)
 
     @property
     def majority_wants_update(self) -> bool:
-        """Whether more than half of the members trusted vote for an update."""
-        return 2 * len(self.wanting_update) > len(self.trusted)
+        """Whether more than half of the teammates trusted vote for an update."""
+        return 2 * len(self.wanting_update) > len(self.trusted_teammates)
 
     def most_others_hold(self, revision: bytes) -> bool:
-        """Whether most of the other members trusted, and at least two, hold a revision."""
-        others = [m for m in self.trusted if m != self.own_id]
+        """Whether most of the other teammates trusted, and at least two, hold a revision."""
+        others = [m for m in self.trusted_teammates if m != self.own_id]
         n_holders = len(set(others) & set(self.holders(revision)))
         return n_holders >= 2 and 2 * n_holders > len(others)
 
     def poll(self, now_s: float) -> list[GroupEvent]:
-        """Return who is lost by now, and forget what it had: it may come back without it."""
+        """Return who is lost by now, and forget what it had: it may come back without it.
+
+        What team we fly with, and who leads it, is seen to as well.
+        """
+        self._note_time(now_s)
         late = [p for p, at_s in self._heard_at_s.items() if now_s >= at_s + self._timeout_s]
         for peer in late:
             del self._heard_at_s[peer]
             self._states.pop(peer, None)
+            self._graph.forget(peer)
+        self._graph.poll(now_s)
+        roster = self._roster()
+        self._team = self._team_by(roster)
+        self._meetings.poll(roster, now_s)
+        self._take_term()
         return [PeerLost(peer) for peer in sorted(late)]
 
     def next_poll_s(self) -> float | None:
@@ -231,3 +335,63 @@ class Group:
         if not self._heard_at_s:
             return None
         return min(self._heard_at_s.values()) + self._timeout_s
+
+    @property
+    def _awaits_leader(self) -> bool:
+        """Whether the leader, which nobody has lost yet, may still come to our team."""
+        if self._team != 0 or self.leader in self._ever_heard:
+            return False
+        if self._has_waited_for_leader:
+            return False
+        return self.epoch == FIRST or not self._has_listened
+
+    @property
+    def _has_waited_for_leader(self) -> bool:
+        return self._now_s >= self._began_at_s + self._leader_wait_s
+
+    @property
+    def _has_listened(self) -> bool:
+        """Whether everybody who is there has been heard by now."""
+        return self._now_s >= self._began_at_s + self._timeout_s
+
+    def _note_time(self, now_s: float) -> None:
+        self._began_at_s = min(self._began_at_s, now_s)
+        self._now_s = max(self._now_s, now_s)
+
+    def _take_term(self) -> None:
+        """Take an epoch when this drone has begun to coordinate, or hears of a newer one."""
+        is_lost = self.leader in self._ever_heard or self._has_waited_for_leader
+        if self._team == 0 and is_lost and self.leader not in self.alive:
+            self._epochs.hear(0, VACANT)
+        if not self.is_coordinator or self._epochs.is_ours(self._team):
+            return
+        if self._team != 0 or self.epoch != FIRST:
+            self._epochs.take(self._team)
+
+    def _takes_us_along(self, peer: int, state: MapState) -> bool:
+        """Whether our coordinator, by what it says now, has gone to a team senior to ours.
+
+        One without a map was restarted, and has not gone anywhere.
+        """
+        if state.team == self._team or self.team_of(peer) != self._team or not state.revision:
+            return False
+        return self.may_lead(peer) and self.is_senior(state.team)
+
+    def _team_by(self, roster: Roster) -> int:
+        """Return the team that this drone is to fly with by now."""
+        if self.own_id in roster.world_of:
+            return self._parting.team(roster, self._now_s)
+        return team_with_a_map(roster) if self._has_listened else self._team
+
+    def _roster(self) -> Roster:
+        believed = {m for m in self.alive if m not in self._distrusted or m == self.leader}
+        mapped = {m: s for m in believed if (s := self._states.get(m)) and s.revision}
+        coordinator = self.coordinator
+        return Roster(
+            self.own_id,
+            self.leader,
+            {m: self.team_of(m) for m in believed},
+            {m: state.world for m, state in mapped.items()},
+            {m for m, state in mapped.items() if state.localized and not state.wants_update},
+            coordinator if coordinator in believed else None,
+        )

@@ -22,8 +22,9 @@ class InterMavOptions(InterOptions):
             do refused ones when nobody could answer the last time: looking costs each
             host a fifth of a second of one core.
         weak_sigma_m: a localized frame whose pose is less certain than this asks too.
-        wait_s: a refused frame waits this long for an answer.
-        max_hosts: peers asked at once.
+        wait_s: a refused frame waits this long for an answer, beyond what the link takes to
+            carry the request.
+        max_hosts: peers asked at once; fewer where the link takes too long for so many.
         detector: features to match two drones' images by; among the map's.
         request_quality: WebP quality of the frame that is sent, 1 to 100, at most.
         request_bytes: of its image, at most: the quality is lowered for it.

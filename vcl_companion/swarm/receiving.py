@@ -46,10 +46,11 @@ _IDLE_SHARE = 0.25  # of the give-up time: silent for this long, and memory may 
 _ANSWERS_SHARE = 0.25
 # A sender that still means a blob asks every five status intervals at the least.
 _SUPERSEDED_INTERVALS = 10.0
-# Of these a sender has one for us at a time, the newest; a map is sent in one form of two.
+# Of these a sender has one for us at a time, the newest; a map is sent in one form of three.
 _ONE_AT_A_TIME = {
     BlobKind.MAP: BlobKind.MAP,
     BlobKind.MAP_UPDATE: BlobKind.MAP,
+    BlobKind.MAP_PART: BlobKind.MAP,
     BlobKind.FRAME_ANSWER: BlobKind.FRAME_ANSWER,
     BlobKind.POSE_REQUEST: BlobKind.POSE_REQUEST,
 }
@@ -144,10 +145,13 @@ class Receptions:
             self._settled[peer, tag] = replace(settled, until_s=until_s)
 
     def is_receiving(self, kind: BlobKind, now_s: float) -> bool:
-        """Whether an unfinished blob of a kind was heard of within the give-up time."""
+        """Whether an unfinished blob of a kind was heard of within the give-up time.
+
+        A map is coming in whatever its form.
+        """
         return any(
             incoming.descriptor is not None
-            and incoming.descriptor.kind == kind
+            and kind in (incoming.descriptor.kind, _ONE_AT_A_TIME.get(incoming.descriptor.kind))
             and now_s - incoming.heard_at_s < self._options.pace.give_up_s
             for incoming in self._incoming.values()
         )

@@ -21,12 +21,13 @@ from vcl_companion.swarm.receiving import BlobReceived, ReceptionAbandoned, Rece
 from vcl_companion.swarm.sending import ALL, BlobDelivered, Sending, TransferFailed
 from vcl_companion.swarm.transfer_options import TransferOptions
 from vcl_companion.swarm.urgency import Message, Turns, Urgency, urgency_of
-from vcl_companion.wire.chunks import Chunk, Descriptor, TransferStatus, describe
+from vcl_companion.wire.chunks import Chunk, Descriptor, Reply, TransferStatus, describe
 from vcl_companion.wire.header import BlobKind
 from vcl_companion.wire.tunnel import PayloadType, TunnelPayload, encode_payload
 
 __all__ = [
     "BlobDelivered",
+    "BlobHeld",
     "BlobKind",
     "BlobReceived",
     "Event",
@@ -37,7 +38,16 @@ __all__ = [
     "Transfers",
 ]
 
-Event = BlobReceived | BlobDelivered | TransferFailed | ReceptionAbandoned
+
+@dataclass(frozen=True)
+class BlobHeld:
+    """A peer has told somebody else that it has a blob whole; ``digest`` as in its status."""
+
+    peer: int
+    digest: bytes
+
+
+Event = BlobReceived | BlobDelivered | BlobHeld | TransferFailed | ReceptionAbandoned
 
 
 @dataclass(frozen=True)
@@ -73,6 +83,15 @@ class Transfers:
         return self._options.pace.image_bytes
 
     @property
+    def quick_bytes(self) -> int:
+        """What may be sent at once of something long: see ``Pace``."""
+        return self._options.pace.quick_bytes
+
+    def carried_in_s(self, n_bytes: int) -> float:
+        """Return how long a blob takes to a peer if nothing else is said meanwhile."""
+        return self._options.pace.carried_in_s(n_bytes)
+
+    @property
     def incoming_memory_bytes(self) -> int:
         """Memory that unfinished incoming blobs take."""
         return self._receptions.memory_bytes
@@ -84,6 +103,11 @@ class Transfers:
         to all of them at once, from the next submitted on.
         """
         self._copies_to_all = n_copies
+
+    @property
+    def shares_network(self) -> bool:
+        """Whether all hear what one sends, at the cost of one."""
+        return self._copies_to_all == 1
 
     def post(self, peer: int, message: Message) -> None:
         """Send a message to a peer, or to all (0), when it is its turn.
@@ -115,7 +139,7 @@ class Transfers:
 
     def _sending_of(self, descriptor: Descriptor, blob: bytes, same: list[Sending]) -> Sending:
         """Return what one more receiver of a blob is added to."""
-        if same and self._copies_to_all == 1:
+        if same and self.shares_network:
             return same[0]
         sending = Sending(descriptor, blob, self._options.pace, self._rng)
         self._sendings.append(sending)
@@ -151,7 +175,7 @@ class Transfers:
                 end = sending.receive(peer, message, now_s)
                 self._drop_ended()
                 return [] if end is None else [end]
-        return []
+        return [BlobHeld(peer, message.digest)] if message.reply == Reply.COMPLETE else []
 
     def poll(self, now_s: float) -> tuple[list[Outgoing], list[Event]]:
         """Return what to send now, as much as the budget allows, and what ended by time."""
@@ -198,7 +222,10 @@ class Transfers:
             key = next(iter(self._posted[urgency]))
             return self._spend(key[1], self._posted[urgency].pop(key))
         if urgency == Urgency.STATUS:
-            return self._spend(*self._owed.popleft())
+            peer, status = self._owed.popleft()
+            # Others may have the same for us.
+            is_news = status.reply == Reply.COMPLETE and self.shares_network
+            return self._spend(ALL if is_news else peer, status)
         sending = ready[urgency].popleft()
         out = self._spend(*sending.next_chunk(now_s))
         sending.last_turn = next(self._next_turn)

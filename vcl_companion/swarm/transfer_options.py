@@ -11,6 +11,7 @@ from typing import Literal
 
 from vcl_companion.errors import ConfigError
 from vcl_companion.swarm.budget import MAX_FRAME_BYTES
+from vcl_companion.wire.chunks import CHUNK_DATA_BYTES
 from vcl_companion.wire.header import MAX_BLOB_BYTES
 
 Profile = Literal["wifi", "radio-57k", "radio-115k"]
@@ -30,6 +31,8 @@ class Pace:
         give_up_s: a sender without progress for this long fails.
         image_bytes: of a keyframe's image, at most: its quality is lowered for it. Of 10 kB
             maps are a centimetre or two worse (docs/network.md).
+        quick_s: who comes to a swarm with a map waits for no more of it at first than takes so
+            long to send (``daemon/map_parts.py``).
     """
 
     rate_bytes_per_s: float
@@ -37,14 +40,24 @@ class Pace:
     status_interval_s: float
     give_up_s: float
     image_bytes: int
+    quick_s: float
+
+    @property
+    def quick_bytes(self) -> int:
+        """How long a blob is that takes ``quick_s`` while nothing else is to be sent."""
+        return int(self.quick_s / self.carried_in_s(1))
+
+    def carried_in_s(self, n_bytes: int) -> float:
+        """Return how long a blob takes with all that is around its chunks on the link."""
+        return n_bytes * MAX_FRAME_BYTES / CHUNK_DATA_BYTES / self.rate_bytes_per_s
 
 
 # A radio of 57,600 baud takes 5,760 bytes/s from us, and the air is everybody's; so 70 %.
 PROFILES: Mapping[Profile, Pace] = MappingProxyType(
     {
-        "wifi": Pace(250_000.0, 8192, 0.2, 30.0, 1_000_000),
-        "radio-57k": Pace(4_000.0, 2 * MAX_FRAME_BYTES, 1.0, 60.0, 10_000),
-        "radio-115k": Pace(8_000.0, 2 * MAX_FRAME_BYTES, 0.6, 45.0, 16_000),
+        "wifi": Pace(250_000.0, 8192, 0.2, 30.0, 1_000_000, 1.0),
+        "radio-57k": Pace(4_000.0, 2 * MAX_FRAME_BYTES, 1.0, 60.0, 10_000, 15.0),
+        "radio-115k": Pace(8_000.0, 2 * MAX_FRAME_BYTES, 0.6, 45.0, 16_000, 10.0),
     }
 )
 
@@ -54,8 +67,9 @@ class TransferOptions:
     """How fast, how patient and how generous transfers are.
 
     Attributes:
-        profile: the kind of link, which the next five follow from unless they are given.
-        rate_bytes_per_s, burst_bytes, status_interval_s, give_up_s, image_bytes: see ``Pace``.
+        profile: the kind of link, which the next six follow from unless they are given.
+        rate_bytes_per_s, burst_bytes, status_interval_s, give_up_s, image_bytes, quick_s: see
+            ``Pace``.
         keep_partial_s: a receiver keeps an unfinished blob, and remembers a
             finished one, this long after it last heard of it.
         max_blob_bytes: longest blob accepted.
@@ -70,6 +84,7 @@ class TransferOptions:
     status_interval_s: float | None = None
     give_up_s: float | None = None
     image_bytes: int | None = None
+    quick_s: float | None = None
     keep_partial_s: float = 120.0
     max_blob_bytes: int = MAX_BLOB_BYTES
     max_incoming_per_peer: int = 4
@@ -85,6 +100,7 @@ class TransferOptions:
             usual.status_interval_s if self.status_interval_s is None else self.status_interval_s,
             usual.give_up_s if self.give_up_s is None else self.give_up_s,
             usual.image_bytes if self.image_bytes is None else self.image_bytes,
+            usual.quick_s if self.quick_s is None else self.quick_s,
         )
 
     def __post_init__(self) -> None:
@@ -95,6 +111,7 @@ class TransferOptions:
             ("rate_bytes_per_s", pace.rate_bytes_per_s),
             ("status_interval_s", pace.status_interval_s),
             ("give_up_s", pace.give_up_s),
+            ("quick_s", pace.quick_s),
             ("keep_partial_s", self.keep_partial_s),
         ):
             if not (math.isfinite(value) and value > 0):

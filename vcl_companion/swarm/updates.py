@@ -312,7 +312,7 @@ class UpdateTrigger:
 
     def _note_tracked(self) -> None:
         """Remember what every member saw last on the map that it has left."""
-        for member in self._group.alive:
+        for member in self._group.teammates:
             state = self._group.state_of(member)
             if state is None:
                 continue
@@ -328,10 +328,10 @@ class UpdateTrigger:
             for member, (revision, tracked) in self._told.items()
             if revision == self._revision
             and member in self._before
-            and member in self._group.alive
+            and member in self._group.teammates
             and tracked > max(_SEES_MORE * self._before[member], self._options.tracked)
         ]
-        return 2 * len(more) > len(self._group.alive)
+        return 2 * len(more) > len(self._group.teammates)
 
     def _is_lost(self, member: int) -> bool:
         state = self._group.state_of(member)

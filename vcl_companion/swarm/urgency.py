@@ -37,6 +37,7 @@ URGENCY_OF_BLOB: Mapping[BlobKind, Urgency] = MappingProxyType(
         BlobKind.FRAME_ANSWER: Urgency.FRAME,
         BlobKind.MAP: Urgency.MAP,
         BlobKind.MAP_UPDATE: Urgency.MAP,
+        BlobKind.MAP_PART: Urgency.MAP,
         BlobKind.PASSED_FRAME: Urgency.MAP,
     }
 )

@@ -19,6 +19,17 @@ _BEHIND_PX = 1e3
 
 
 @compiled
+def _turned_back(pose: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return a point in the axes of a (3, 4) pose."""
+    x, y, z = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
+    return (
+        pose[0, 0] * x + pose[1, 0] * y + pose[2, 0] * z,
+        pose[0, 1] * x + pose[1, 1] * y + pose[2, 1] * z,
+        pose[0, 2] * x + pose[1, 2] * y + pose[2, 2] * z,
+    )
+
+
+@compiled
 def _linearized(
     point: Array,
     body: Array,
@@ -33,39 +44,28 @@ def _linearized(
 
     ``body`` is world_from_body, ``mounting`` body_from_cam, each (3, 4).
     """
-    p = np.empty(3)
-    c = np.empty(3)
-    for r in range(3):
-        p[r] = (
-            body[0, r] * (point[0] - body[0, 3])
-            + body[1, r] * (point[1] - body[1, 3])
-            + body[2, r] * (point[2] - body[2, 3])
-        )
-    for r in range(3):
-        c[r] = (
-            mounting[0, r] * (p[0] - mounting[0, 3])
-            + mounting[1, r] * (p[1] - mounting[1, 3])
-            + mounting[2, r] * (p[2] - mounting[2, 3])
-        )
-    if not c[2] > _MIN_DEPTH_M:
+    p0, p1, p2 = _turned_back(body, point[0], point[1], point[2])
+    c0, c1, c2 = _turned_back(mounting, p0, p1, p2)
+    if not c2 > _MIN_DEPTH_M:
         residual[:] = _BEHIND_PX
         j_pose[:] = 0.0
         j_point[:] = 0.0
         return
-    u, v = c[0] / c[2], c[1] / c[2]
+    inverse = 1.0 / c2
+    u, v = c0 * inverse, c1 * inverse
+    off_u, off_v = u - ideal[0], v - ideal[1]
     for k in range(2):
-        residual[k] = slopes[k, 0] * (u - ideal[0]) + slopes[k, 1] * (v - ideal[1])
-        a = slopes[k, 0] / c[2]
-        b = slopes[k, 1] / c[2]
-        d = -(slopes[k, 0] * u + slopes[k, 1] * v) / c[2]
+        by_u, by_v = slopes[k, 0], slopes[k, 1]
+        a, b, d = by_u * inverse, by_v * inverse, -(by_u * u + by_v * v) * inverse
         # By the point in body axes.
         x = a * mounting[0, 0] + b * mounting[0, 1] + d * mounting[0, 2]
         y = a * mounting[1, 0] + b * mounting[1, 1] + d * mounting[1, 2]
         z = a * mounting[2, 0] + b * mounting[2, 1] + d * mounting[2, 2]
+        residual[k] = by_u * off_u + by_v * off_v
         j_pose[k, 0], j_pose[k, 1], j_pose[k, 2] = -x, -y, -z
-        j_pose[k, 3] = y * p[2] - z * p[1]
-        j_pose[k, 4] = z * p[0] - x * p[2]
-        j_pose[k, 5] = x * p[1] - y * p[0]
+        j_pose[k, 3] = y * p2 - z * p1
+        j_pose[k, 4] = z * p0 - x * p2
+        j_pose[k, 5] = x * p1 - y * p0
         for r in range(3):
             j_point[k, r] = x * body[r, 0] + y * body[r, 1] + z * body[r, 2]
 
@@ -111,15 +111,18 @@ def cost_of(
     cauchy_px: float,
 ) -> float:
     """Return the robust cost, px^2."""
-    residual, j_pose, j_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
     cost = 0.0
     for j in range(len(first) - 1):
         for m in range(first[j], first[j + 1]):
             i = view[m]
-            _linearized(
-                points[j], bodies[i], mountings[i], slopes[m], ideal[m], residual, j_pose, j_point
-            )
-            squared = residual[0] ** 2 + residual[1] ** 2
+            x, y, z = _turned_back(bodies[i], points[j, 0], points[j, 1], points[j, 2])
+            x, y, z = _turned_back(mountings[i], x, y, z)
+            squared = 2.0 * _BEHIND_PX**2
+            if z > _MIN_DEPTH_M:
+                u, v = x / z - ideal[m, 0], y / z - ideal[m, 1]
+                squared = (slopes[m, 0, 0] * u + slopes[m, 0, 1] * v) ** 2 + (
+                    slopes[m, 1, 0] * u + slopes[m, 1, 1] * v
+                ) ** 2
             cost += cauchy_px**2 * np.log1p(squared / cauchy_px**2)
     return cost
 
@@ -179,12 +182,12 @@ def reduced(
     Returns:
         (6V, 6V) reduced normal matrix, (6V,) its right side, (6V,) the poses' own
         diagonal, (N, 3, 3) inverses of the landmarks' blocks, (N, 3) their right
-        sides, (M, 6, 3) couplings.
+        sides, (M, 3, 6) couplings.
     """
     size = 6 * len(bodies)
     normal, rhs, diagonal = np.zeros((size, size)), np.zeros(size), np.zeros(size)
     inverses, pulls = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
-    crosses = np.zeros((len(view), 6, 3))
+    crosses = np.zeros((len(view), 3, 6))
     residual, j_pose, j_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
     block, left = np.empty((3, 3)), np.empty((6, 3))
     for j in range(len(points)):
@@ -205,7 +208,7 @@ def reduced(
                 for c in range(6):
                     normal[a + r, a + c] += wr0 * j_pose[0, c] + wr1 * j_pose[1, c]
                 for c in range(3):
-                    crosses[m, r, c] = wr0 * j_point[0, c] + wr1 * j_point[1, c]
+                    crosses[m, c, r] = wr0 * j_point[0, c] + wr1 * j_point[1, c]
                 diagonal[a + r] += wr0 * j_pose[0, r] + wr1 * j_pose[1, r]
             for r in range(3):
                 wr0, wr1 = weight * j_point[0, r], weight * j_point[1, r]
@@ -223,9 +226,9 @@ def reduced(
             for r in range(6):
                 for c in range(3):
                     left[r, c] = (
-                        crosses[m, r, 0] * inverse[0, c]
-                        + crosses[m, r, 1] * inverse[1, c]
-                        + crosses[m, r, 2] * inverse[2, c]
+                        crosses[m, 0, r] * inverse[0, c]
+                        + crosses[m, 1, r] * inverse[1, c]
+                        + crosses[m, 2, r] * inverse[2, c]
                     )
                 rhs[a + r] -= (
                     left[r, 0] * pulls[j, 0] + left[r, 1] * pulls[j, 1] + left[r, 2] * pulls[j, 2]
@@ -233,14 +236,12 @@ def reduced(
             for n in range(first[j], m + 1):
                 if view[n] < n_held:
                     continue
-                b = 6 * view[n]
+                b, cross = 6 * view[n], crosses[n]
                 for r in range(6):
+                    # A row from zero on: numba looks out for negative positions otherwise.
+                    row, x, y, z = normal[a + r, b : b + 6], left[r, 0], left[r, 1], left[r, 2]
                     for c in range(6):
-                        normal[a + r, b + c] -= (
-                            left[r, 0] * crosses[n, c, 0]
-                            + left[r, 1] * crosses[n, c, 1]
-                            + left[r, 2] * crosses[n, c, 2]
-                        )
+                        row[c] -= x * cross[0, c] + y * cross[1, c] + z * cross[2, c]
     # Observations of a landmark stand by rising view: only blocks below the diagonal were written.
     for a in range(size):
         for b in range(a):
@@ -276,7 +277,7 @@ def substituted(
             a = 6 * view[m]
             for r in range(6):
                 for c in range(3):
-                    right[c] -= crosses[m, r, c] * pose_step[a + r]
+                    right[c] -= crosses[m, c, r] * pose_step[a + r]
         for r in range(3):
             out[j, r] = (
                 inverses[j, r, 0] * right[0]

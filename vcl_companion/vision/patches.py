@@ -39,6 +39,12 @@ class Pyramid:
     texels: NDArray[np.uint8]
     shelves: Ints
 
+    @property
+    def image(self) -> Image:
+        """(H, W) the image at full resolution."""
+        _, height, width = self.shelves[0]
+        return np.asarray(self.texels[: height * width].reshape(height, width))
+
 
 def pyramid_of(image: Image, n_levels: int = _N_LEVELS) -> Pyramid:
     """Reduce an image step by step; a level's pixel (0, 0) is the full image's.

@@ -11,7 +11,7 @@ from enum import IntEnum
 
 from vcl_companion.errors import WireError
 
-PROTOCOL_VERSION = 2
+PROTOCOL_VERSION = 3
 MAX_PAYLOAD_BYTES = 128  # of one MAVLink TUNNEL
 MAX_BLOB_BYTES = 8 * 1024 * 1024
 
@@ -42,6 +42,7 @@ class BlobKind(IntEnum):
     POSE_REQUEST = 67
     MAP_UPDATE = 68
     PASSED_FRAME = 69
+    MAP_PART = 70
 
 
 class VersionMismatchError(WireError):

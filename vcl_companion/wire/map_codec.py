@@ -1,10 +1,8 @@
 """The shared map (IV-C) as bytes, and the revision that names them.
 
 Every accepted map has exactly one byte string: ``encode_map(decode_map(b)) ==
-b``. Points lie on a grid of 2^-12 m and pixels on one of 2^-5 px (both finer
-than what they were measured to); poses, cameras and images are kept exactly.
-A pixel is told as what it is off from where its keyframe would see the point: a
-tenth of a pixel takes a third of the bits of a place in the image.
+b``. Points and pixels lie on grids finer than what they were measured to
+(``landmark_grid``); poses, cameras and images are kept exactly.
 """
 
 from __future__ import annotations
@@ -17,18 +15,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from vcl_companion.errors import WireError
+from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
-from vcl_companion.vision.information import is_covariance
-from vcl_companion.wire.columns import (
-    Integers,
-    encode_bits,
-    encode_column,
-    encode_residuals,
-    take_bits,
-    take_column,
-    take_residuals,
+from vcl_companion.geometry.similarity import Similarity
+from vcl_companion.mapping.landmark_map import (
+    MAX_JOINED,
+    NAME_BYTES,
+    JoinedMap,
+    Keyframe,
+    KnownDistance,
+    LandmarkMap,
 )
+from vcl_companion.vision.information import is_covariance
 from vcl_companion.wire.header import (
     HEADER_BYTES,
     MAX_BLOB_BYTES,
@@ -36,6 +34,9 @@ from vcl_companion.wire.header import (
     decode_header,
     encode_header,
 )
+from vcl_companion.wire.landmark_grid import Views, pixels_of_steps, steps_of_pixels
+from vcl_companion.wire.landmark_kernels import Integers
+from vcl_companion.wire.map_landmarks import decode_landmarks, encode_landmarks
 from vcl_companion.wire.pose_codec import (
     MAX_COORDINATE_M,
     encode_camera,
@@ -47,7 +48,7 @@ from vcl_companion.wire.pose_codec import (
 )
 from vcl_companion.wire.reader import Reader
 
-REVISION_BYTES = 8
+REVISION_BYTES = NAME_BYTES
 MAX_KEYFRAMES = 256
 MAX_LANDMARKS = 32_768
 MAX_CELLS = 1 << 20  # landmarks times keyframes: bounds the observation table
@@ -61,7 +62,10 @@ MAX_DISTANCES = 256
 # | 8  | u32     | landmarks N                             |
 # | 12 | f64     | pixel noise, px                         |
 # | 20 | 8 bytes | parent revision, zeros when there is none |
-_HEAD = struct.Struct("<BBHHId8s")
+# | 28 | u8      | bytes of the world's name: 0 or 8; 8 only with a parent |
+# | 29 | 8 bytes | the world's name, zeros when it has none |
+# | 37 | u8      | joined maps J, at most 16; some only with a world |
+_HEAD = struct.Struct("<BBHHId8sB8sB")
 _DETECTORS = ("akaze", "sift", "orb")  # bit by bit
 _ANCHORED = 1 << len(_DETECTORS)
 
@@ -72,16 +76,16 @@ _UPPER = np.triu_indices(6)
 # D times | 0 | 2 x u16 | keyframes a, b | then | 4 | 2 x f64 | distance, sigma, m |
 _DISTANCE = struct.Struct("<2H2d")
 
+# J times | 0 | 2 x 8 bytes | revision, world | then world_from_other: a pose (see pose_codec),
+# | 56 | f64 | its scale |
+_SCALE = struct.Struct("<d")
+_MAX_SCALE = 10.0  # nor smaller than one over this: no two maps in metres differ by more
+
 # V times | 0 | u8 | drone | 1 | u64 | captured at, ns | then two poses (world_from_body,
 # body_from_cam), camera, image: see pose_codec
 _KEYFRAME = struct.Struct("<BQ")
 
-# Then three columns x, y, z of N values in steps of 2^-12 m, then for every keyframe N bits
-# (seen there) and, of its seen landmarks, residuals u and residuals v in steps of 2^-5 px: the
-# pixel from -1 on less the point's projection (none: the middle of the image), both rounded.
-_STEPS_PER_M = 1 << 12
-_STEPS_PER_PX = 1 << 5
-_MARGIN_PX = 1.0  # a subpixel peak may lie a little outside of the image
+# Then the landmarks, see ``map_landmarks``, to the end.
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +99,8 @@ class MapHead:
     distances: tuple[KnownDistance, ...]
     parent: bytes
     anchor_covariance: Array
+    world: bytes
+    joined: tuple[JoinedMap, ...]
 
     @classmethod
     def of(cls, m: LandmarkMap) -> MapHead:
@@ -108,50 +114,34 @@ class MapHead:
             m.distances,
             m.parent,
             m.anchor_covariance,
+            m.world,
+            m.joined,
         )
 
-    def map_with(self, points: Integers, pixels: Integers) -> LandmarkMap:
+    def map_with(self, points: Array, pixels: Integers) -> LandmarkMap:
         """Return the map whose landmarks lie there.
 
         Args:
-            points: (N, 3) steps of 2^-12 m.
-            pixels: (N, V, 2) steps of 2^-5 px, see ``steps_of_pixels``.
+            points: (N, 3) world frame, m.
+            pixels: (N, V, 2) steps, see ``steps_of_pixels``.
 
         Raises:
             ValueError: they are no landmarks, or out of range.
         """
-        if np.abs(points).max(initial=0) > MAX_COORDINATE_M * _STEPS_PER_M:
+        if np.abs(points).max(initial=0.0) > MAX_COORDINATE_M:
             raise ValueError("a landmark lies out of range")
         return LandmarkMap(
             keyframes=self.keyframes,
-            points_world=points / _STEPS_PER_M,
-            observed_px=np.where(pixels < 0, np.nan, pixels / _STEPS_PER_PX - _MARGIN_PX),
+            points_world=points,
+            observed_px=pixels_of_steps(pixels),
             pixel_noise_px=self.pixel_noise_px,
             detectors=self.detectors,
             distances=self.distances,
             parent=self.parent,
             anchor_covariance=self.anchor_covariance,
+            world=self.world,
+            joined=self.joined,
         )
-
-
-def steps_of_points(points_world: Array) -> Integers:
-    """Return (N, 3) points in steps of 2^-12 m."""
-    return np.rint(points_world * _STEPS_PER_M).astype(np.int64)
-
-
-def steps_of_pixels(observed_px: Array) -> Integers:
-    """Return (..., 2) pixels in steps of 2^-5 px from pixel -1 on; -1 where there is none.
-
-    Raises:
-        ValueError: an observation has one of its coordinates only, or lies before that.
-    """
-    seen = np.isfinite(observed_px)
-    if (seen[..., 0] != seen[..., 1]).any():
-        raise ValueError("an observation has only one of its two coordinates")
-    steps = np.rint((np.where(seen, observed_px, 0.0) + _MARGIN_PX) * _STEPS_PER_PX)
-    if (seen & (steps < 0)).any():
-        raise ValueError("an observation lies outside of its image")
-    return np.where(seen, steps, -1).astype(np.int64)
 
 
 def revision_of(data: bytes) -> bytes:
@@ -168,8 +158,8 @@ def parent_of(data: bytes) -> bytes:
     kind = decode_header(data)
     if kind != BlobKind.MAP:
         raise WireError(f"not a map: blob kind {kind}")
-    _, n_parent, _, _, _, _, parent = Reader(data, "map", HEADER_BYTES).unpack(_HEAD)
-    return _checked_parent(n_parent, parent)
+    _, n_parent, _, _, _, _, parent, *_ = Reader(data, "map", HEADER_BYTES).unpack(_HEAD)
+    return _checked_name(n_parent, parent)
 
 
 def encode_map(landmark_map: LandmarkMap) -> bytes:
@@ -181,13 +171,9 @@ def encode_map(landmark_map: LandmarkMap) -> bytes:
     m = landmark_map
     if len(m.points_world) and np.abs(m.points_world).max() > MAX_COORDINATE_M:
         raise ValueError(f"a landmark lies further than {MAX_COORDINATE_M:.0f} m from the origin")
-    parts = [encode_header(BlobKind.MAP), encode_head(MapHead.of(m))]
-    points, pixels = steps_of_points(m.points_world), steps_of_pixels(m.observed_px)
-    parts += [encode_column(points[:, axis]) for axis in range(3)]
-    for i, keyframe in enumerate(m.keyframes):
-        seen = pixels[:, i, 0] >= 0
-        parts += [encode_bits(seen), encode_pixels(pixels[seen, i], points[seen], keyframe)]
-    data = b"".join(parts)
+    head = encode_header(BlobKind.MAP) + encode_head(MapHead.of(m))
+    pixels = steps_of_pixels(m.observed_px)
+    data = head + encode_landmarks(m.points_world, pixels, Views(m.keyframes))
     if len(data) > MAX_BLOB_BYTES:
         raise ValueError(f"a map of {len(data)} bytes, at most {MAX_BLOB_BYTES}")
     return data
@@ -204,8 +190,7 @@ def encode_head(m: MapHead) -> bytes:
     detectors = sum(1 << bit for bit, name in enumerate(_DETECTORS) if name in m.detectors)
     if not m.detectors or not set(m.detectors) <= set(_DETECTORS):
         raise ValueError(f"detectors must be some of {', '.join(_DETECTORS)}: {m.detectors}")
-    if len(m.parent) not in (0, REVISION_BYTES):
-        raise ValueError(f"a parent revision has 0 or {REVISION_BYTES} bytes: {m.parent!r}")
+    _check_line(m.parent, m.world, len(m.joined))
     is_anchored = bool(m.anchor_covariance.any())
     parts = [
         _HEAD.pack(
@@ -216,6 +201,9 @@ def encode_head(m: MapHead) -> bytes:
             n_landmarks,
             m.pixel_noise_px,
             m.parent,
+            len(m.world),
+            m.world,
+            len(m.joined),
         ),
     ]
     if is_anchored:
@@ -227,6 +215,7 @@ def encode_head(m: MapHead) -> bytes:
                 distance.keyframe_a, distance.keyframe_b, distance.distance_m, distance.sigma_m
             )
         )
+    parts += [_encode_joined(joined) for joined in m.joined]
     n_bytes = sum(len(keyframe.image_bytes) for keyframe in m.keyframes)
     if n_bytes > MAX_BLOB_BYTES:
         raise ValueError(f"a map with {n_bytes} bytes of images, at most {MAX_BLOB_BYTES}")
@@ -247,13 +236,8 @@ def decode_map(data: bytes) -> LandmarkMap:
     reader = Reader(data, "map", HEADER_BYTES)
     try:
         head = take_head(reader)
-        points = np.stack([take_column(reader, head.n_landmarks) for _ in range(3)], axis=1)
-        pixels = np.full((head.n_landmarks, len(head.keyframes), 2), -1, dtype=np.int64)
-        for i, keyframe in enumerate(head.keyframes):
-            seen = take_bits(reader, head.n_landmarks)
-            pixels[seen, i] = take_pixels(reader, points[seen], keyframe)
-        reader.finish()
-        return head.map_with(points, pixels)
+        views = Views(head.keyframes)
+        return head.map_with(*decode_landmarks(reader.rest(), head.n_landmarks, views))
     except ValueError as error:
         raise WireError(f"map: {error}") from None
 
@@ -265,18 +249,21 @@ def take_head(reader: Reader) -> MapHead:
         WireError: the bytes are none.
         ValueError: or are out of bounds.
     """
-    detectors, n_parent, n_keyframes, n_distances, n_landmarks, noise_px, parent = reader.unpack(
-        _HEAD
-    )
+    (
+        detectors, n_parent, n_keyframes, n_distances, n_landmarks, noise_px, parent,
+        n_world, world, n_joined,
+    ) = reader.unpack(_HEAD)  # fmt: skip
     is_anchored = bool(detectors & _ANCHORED)
     if not (detectors & (_ANCHORED - 1) and detectors < 2 * _ANCHORED):
         raise WireError(f"map: unknown detectors {detectors:#x}")
-    parent = _checked_parent(n_parent, parent)
+    parent, world = _checked_name(n_parent, parent), _checked_name(n_world, world)
+    _check_line(parent, world, n_joined)
     _check_counts(n_landmarks, n_keyframes, n_distances)
     anchor = _take_anchor(reader) if is_anchored else np.zeros((6, 6))
     distances = tuple(KnownDistance(*reader.unpack(_DISTANCE)) for _ in range(n_distances))
     for distance in distances:
         _check_distance(distance)
+    joined = tuple(_take_joined(reader) for _ in range(n_joined))
     return MapHead(
         tuple(_take_keyframe(reader) for _ in range(n_keyframes)),
         n_landmarks,
@@ -285,6 +272,8 @@ def take_head(reader: Reader) -> MapHead:
         distances,
         parent,
         anchor,
+        world,
+        joined,
     )
 
 
@@ -302,11 +291,33 @@ def _take_anchor(reader: Reader) -> Array:
     return covariance
 
 
-def _checked_parent(n_bytes: int, padded: bytes) -> bytes:
-    """Return the parent revision of its two fields."""
-    if n_bytes not in (0, REVISION_BYTES) or padded[n_bytes:].strip(b"\0"):
-        raise WireError("map: malformed parent revision")
+def _checked_name(n_bytes: int, padded: bytes) -> bytes:
+    """Return the parent revision, or the world's name, of its two fields."""
+    if n_bytes not in (0, NAME_BYTES) or padded[n_bytes:].strip(b"\0"):
+        raise WireError("map: malformed parent revision or world")
     return padded[:n_bytes]
+
+
+def _encode_joined(joined: JoinedMap) -> bytes:
+    """Return the bytes of a map that was merged into this one."""
+    at = joined.world_from_other
+    _check_scale(at.scale)
+    pose = encode_pose(Pose(at.rotation, at.translation))
+    return joined.revision + joined.world + pose + _SCALE.pack(at.scale)
+
+
+def _take_joined(reader: Reader) -> JoinedMap:
+    """Return the merged map that comes next.
+
+    Raises:
+        WireError: it is none.
+        ValueError: or its scale is out of bounds.
+    """
+    revision, world = reader.take(NAME_BYTES), reader.take(NAME_BYTES)
+    pose = take_pose(reader)
+    (scale,) = reader.unpack(_SCALE)
+    _check_scale(scale)
+    return JoinedMap(revision, world, Similarity(pose.rotation, pose.translation, scale))
 
 
 def _encode_keyframe(keyframe: Keyframe) -> bytes:
@@ -339,54 +350,6 @@ def _take_keyframe(reader: Reader) -> Keyframe:
     )
 
 
-def encode_pixels(steps: Integers, points: Integers, keyframe: Keyframe) -> bytes:
-    """Return the residuals of (n, 2) steps in a keyframe's image that show (n, 3) points.
-
-    Raises:
-        ValueError: some lie outside of the image.
-    """
-    if len(steps) and (steps.min() < 0 or (steps > _largest_steps(keyframe)).any()):
-        raise ValueError("an observation lies outside of its image")
-    residuals = steps - _expected_steps(points, keyframe)
-    return encode_residuals(residuals[:, 0]) + encode_residuals(residuals[:, 1])
-
-
-def take_pixels(reader: Reader, points: Integers, keyframe: Keyframe) -> Integers:
-    """Return the (n, 2) steps in a keyframe's image, of (n, 3) points, that come next.
-
-    Raises:
-        WireError: they are none, or lie outside of the image.
-    """
-    n = len(points)
-    residuals = np.stack([take_residuals(reader, n), take_residuals(reader, n)], axis=1)
-    steps = residuals + _expected_steps(points, keyframe)
-    if n and (steps.min() < 0 or (steps > _largest_steps(keyframe)).any()):
-        raise WireError("map: an observation lies outside of its image")
-    return steps
-
-
-def _expected_steps(points: Integers, keyframe: Keyframe) -> Integers:
-    """Return (n, 2) steps where a keyframe would see points; the middle if outside or nowhere.
-
-    Arithmetic of two machines differs by 1e-11 of a step: where that moves the rounding, an
-    observation is a step off there, and an update made on the other is refused by its revision.
-    """
-    cam_from_world = (keyframe.world_from_body @ keyframe.body_from_cam).inverse()
-    pixels = keyframe.camera.project(cam_from_world.apply(points / _STEPS_PER_M))
-    largest = _largest_steps(keyframe)
-    with np.errstate(invalid="ignore"):
-        steps = np.rint((pixels + _MARGIN_PX) * _STEPS_PER_PX)
-        inside = ((steps >= 0) & (steps <= largest)).all(axis=1, keepdims=True)
-    return np.where(inside, np.nan_to_num(steps), largest // 2).astype(np.int64)
-
-
-def _largest_steps(keyframe: Keyframe) -> Integers:
-    """Return the (2,) largest value of the columns u, v."""
-    camera = keyframe.camera
-    size_px = np.array([camera.width_px, camera.height_px], dtype=np.int64)
-    return (size_px + int(_MARGIN_PX)) * _STEPS_PER_PX
-
-
 def _check_counts(n_landmarks: int, n_keyframes: int, n_distances: int) -> None:
     """Raise ValueError for counts out of bounds, before any work is done for them."""
     if not 1 <= n_keyframes <= MAX_KEYFRAMES:
@@ -395,6 +358,22 @@ def _check_counts(n_landmarks: int, n_keyframes: int, n_distances: int) -> None:
         raise ValueError(f"{n_landmarks} landmarks in {n_keyframes} keyframes are too many")
     if n_distances > MAX_DISTANCES:
         raise ValueError(f"{n_distances} known distances, at most {MAX_DISTANCES}")
+
+
+def _check_line(parent: bytes, world: bytes, n_joined: int) -> None:
+    """Raise ValueError for what cannot be said of where a map comes from."""
+    if len(parent) not in (0, REVISION_BYTES):
+        raise ValueError(f"a parent revision has 0 or {REVISION_BYTES} bytes: {parent!r}")
+    if world and not parent:
+        raise ValueError("a first map is its own world")
+    if n_joined > MAX_JOINED or (n_joined and not world):
+        raise ValueError(f"{n_joined} joined maps, at most {MAX_JOINED}, and none of a first map")
+
+
+def _check_scale(scale: float) -> None:
+    """Raise ValueError for a scale between two maps in metres that there cannot be."""
+    if not 1.0 / _MAX_SCALE <= scale <= _MAX_SCALE:
+        raise ValueError(f"a joined map at a scale of {scale}")
 
 
 def _check_distance(distance: KnownDistance) -> None:

@@ -1,4 +1,4 @@
-"""A map for one who has its parent: what is known there stays at home.
+"""A map for one who has its parent, or a first one for one who has none: what is known stays there.
 
 Images are nearly all of a map. An update keeps most of its parent's, and the others
 may have been sent ahead, while the map was being built; of the landmarks it tells what
@@ -13,6 +13,8 @@ import struct
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 
+import numpy as np
+
 from vcl_companion.errors import WireError
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.wire.header import HEADER_BYTES, BlobKind, decode_header, encode_header
@@ -26,7 +28,7 @@ from vcl_companion.wire.map_codec import (
     revision_of,
     take_head,
 )
-from vcl_companion.wire.map_delta import encode_landmarks, take_landmarks
+from vcl_companion.wire.map_delta import encode_changes, take_changes
 from vcl_companion.wire.reader import Reader
 
 # | 2  | 8 bytes | revision of the whole map                                        |
@@ -35,6 +37,8 @@ from vcl_companion.wire.reader import Reader
 # |    |         | eight bytes names an image that was sent ahead; then map_delta   |
 _PLACE = struct.Struct("<H")
 _NAME_BYTES = 8
+# What a first map was made from.
+_NO_MAP = LandmarkMap((), np.zeros((0, 3)), np.zeros((0, 0, 2)), 1.0, (), (), b"")
 
 
 def name_of_image(image_bytes: bytes) -> bytes:
@@ -42,18 +46,18 @@ def name_of_image(image_bytes: bytes) -> bytes:
     return hashlib.sha256(image_bytes).digest()[:_NAME_BYTES]
 
 
-def encode_map_update(data: bytes, parent: LandmarkMap) -> bytes:
+def encode_map_update(data: bytes, parent: LandmarkMap | None) -> bytes:
     """Return the bytes of a map without what its parent has.
 
     Args:
         data: the whole map, encoded.
-        parent: the revision that it names as its parent, decoded.
+        parent: the revision that it names as its parent, decoded; None for a first map.
 
     Raises:
         WireError: ``data`` is no map.
         ValueError: it has an image that is taken for a reference.
     """
-    whole = decode_map(data)
+    whole, parent = decode_map(data), parent or _NO_MAP
     place_of = {keyframe.image_bytes: k for k, keyframe in enumerate(parent.keyframes)}
     places = [place_of.get(keyframe.image_bytes) for keyframe in whole.keyframes]
     keyframes = []
@@ -63,7 +67,7 @@ def encode_map_update(data: bytes, parent: LandmarkMap) -> bytes:
         image = keyframe.image_bytes if place is None else _PLACE.pack(place)
         keyframes.append(replace(keyframe, image_bytes=image))
     head = encode_head(replace(MapHead.of(whole), keyframes=tuple(keyframes)))
-    return _joined(revision_of(data), head + encode_landmarks(whole, parent, places))
+    return _joined(revision_of(data), head + encode_changes(whole, parent, places))
 
 
 def images_in_update(update: bytes) -> frozenset[bytes]:
@@ -115,12 +119,14 @@ def names_of_update(blob: bytes) -> tuple[bytes, bytes]:
     return revision, parent_of(encode_header(BlobKind.MAP) + reader.rest())
 
 
-def decode_map_update(blob: bytes, parent: LandmarkMap, held: Mapping[bytes, bytes]) -> bytes:
+def decode_map_update(
+    blob: bytes, parent: LandmarkMap | None, held: Mapping[bytes, bytes]
+) -> bytes:
     """Return the whole map's bytes.
 
     Args:
         blob: what came.
-        parent: the map that it was made from, decoded.
+        parent: the map that it was made from, decoded; None for a first map.
         held: images that were sent ahead, by their names.
 
     Raises:
@@ -128,15 +134,14 @@ def decode_map_update(blob: bytes, parent: LandmarkMap, held: Mapping[bytes, byt
             image that is not held.
     """
     revision, reader = _split(blob)
-    head = _head_of(reader)
+    head, parent = _head_of(reader), parent or _NO_MAP
     places = [_place(keyframe, parent) for keyframe in head.keyframes]
     keyframes = tuple(
         replace(k, image_bytes=_image(k, place, parent, held))
         for k, place in zip(head.keyframes, places, strict=True)
     )
     try:
-        whole = take_landmarks(reader, replace(head, keyframes=keyframes), parent, places)
-        reader.finish()
+        whole = take_changes(reader, replace(head, keyframes=keyframes), parent, places)
         data = encode_map(whole)
     except ValueError as error:  # the images may make it longer than peers accept
         raise WireError(f"map update: {error}") from None

@@ -6,12 +6,17 @@ import struct
 from dataclasses import dataclass
 
 from vcl_companion.errors import WireError
+from vcl_companion.vision.signature import SIGNATURE_BYTES
 from vcl_companion.wire.map_codec import MAX_LANDMARKS, REVISION_BYTES
 from vcl_companion.wire.reader import Reader
 
 MAX_AGE_S = 3600.0
 MAX_REASON_BYTES = 90
 MAX_TRACKED = (1 << 16) - 1
+MAX_TEAM = (1 << 8) - 1
+MAX_EPOCH = (1 << 32) - 1
+WORLD_BYTES = 8
+_NO_WORLD = bytes(WORLD_BYTES)
 
 # FrameRequest body
 # | 0  | u32 | request id                                             |
@@ -26,7 +31,12 @@ _FRAME_REQUEST = struct.Struct("<Iqd")
 # | 13 | u8     | 1: localized in it now, 0: not           |
 # | 14 | u8     | 1: wants it updated, 0: not              |
 # | 15 | u16    | landmarks that agreed in the last frame  |
-_MAP_STATE = struct.Struct("<B8sIBBH")
+# | 17 | u8     | team                                     |
+# | 18 | u32    | epoch: the highest known of that team    |
+# | 22 | 8 bytes | world of that map, zeros when unknown   |
+# | 30 | u8     | bytes of the signature, at most 48       |
+# | 31 | rest   | signature of a frame                     |
+_MAP_STATE = struct.Struct("<B8sIBBHBI8sB")
 
 # MapRefused body
 # | 0 | u32  | request id                                |
@@ -66,6 +76,11 @@ class MapState:
         localized: whether it localizes in it now.
         tracked: landmarks that agreed on the pose of its last frame; 0 when there is none.
         wants_update: its vote: it sees too few of them (IV-G).
+        team: who it flies with, named by a system id; 0 from the start (``swarm/teams.py``).
+        epoch: the highest that it knows of that team.
+        world: 8 bytes, the first map of the line that its map is of; empty without a map, or
+            where that is not known.
+        signature: of a frame of the last seconds (``vision/signature.py``); empty most times.
     """
 
     revision: bytes
@@ -73,6 +88,10 @@ class MapState:
     localized: bool
     tracked: int = 0
     wants_update: bool = False
+    team: int = 0
+    epoch: int = 0
+    world: bytes = b""
+    signature: bytes = b""
 
     def __post_init__(self) -> None:
         if len(self.revision) not in (0, REVISION_BYTES):
@@ -81,6 +100,16 @@ class MapState:
             raise ValueError(f"a map of {self.n_landmarks} landmarks, at most {MAX_LANDMARKS}")
         if not 0 <= self.tracked <= MAX_TRACKED:
             raise ValueError(f"tracked landmarks have 16 bits: {self.tracked}")
+        if not 0 <= self.team <= MAX_TEAM:
+            raise ValueError(f"a team has 8 bits: {self.team}")
+        if not 0 <= self.epoch <= MAX_EPOCH:
+            raise ValueError(f"an epoch has 32 bits: {self.epoch}")
+        if len(self.world) not in (0, WORLD_BYTES) or self.world == _NO_WORLD:
+            raise ValueError(f"a world has 0 or {WORLD_BYTES} bytes, not all 0: {self.world!r}")
+        if len(self.signature) > SIGNATURE_BYTES:
+            raise ValueError(
+                f"a signature of {len(self.signature)} bytes, at most {SIGNATURE_BYTES}"
+            )
 
 
 @dataclass(frozen=True)
@@ -123,27 +152,45 @@ def decode_frame_request(body: bytes) -> FrameRequest:
 
 def encode_map_state(message: MapState) -> bytes:
     """Return the body of a map state."""
-    return _MAP_STATE.pack(
+    head = _MAP_STATE.pack(
         len(message.revision),
         message.revision,
         message.n_landmarks,
         message.localized,
         message.wants_update,
         message.tracked,
+        message.team,
+        message.epoch,
+        message.world or _NO_WORLD,
+        len(message.signature),
     )
+    return head + message.signature
 
 
 def decode_map_state(body: bytes) -> MapState:
     """Return the map state of a body, or raise WireError."""
     reader = Reader(body, "map state")
-    n_revision, revision, n_landmarks, localized, wants, tracked = reader.unpack(_MAP_STATE)
+    fields = reader.unpack(_MAP_STATE)
+    n_revision, revision, n_landmarks, localized, wants, tracked = fields[:6]
+    team, epoch, world, n_signature = fields[6:]
+    signature = reader.take(n_signature)
     reader.finish()
     if n_revision > REVISION_BYTES or revision[n_revision:].strip(b"\0"):
         raise WireError("map state: malformed")
     if localized > 1 or wants > 1:
         raise WireError("map state: neither yes nor no")
     try:
-        return MapState(revision[:n_revision], n_landmarks, bool(localized), tracked, bool(wants))
+        return MapState(
+            revision[:n_revision],
+            n_landmarks,
+            bool(localized),
+            tracked,
+            bool(wants),
+            team,
+            epoch,
+            b"" if world == _NO_WORLD else world,
+            signature,
+        )
     except ValueError as error:
         raise WireError(f"map state: {error}") from None
 

@@ -94,6 +94,15 @@ def take_pose(reader: Reader) -> Pose:
     return Pose.from_quaternion(quaternion, translation)
 
 
+def rounded_pose(pose: Pose) -> Pose:
+    """Return a pose as whoever reads its bytes has it; one that was read stays as it is.
+
+    Raises:
+        ValueError: see ``encode_pose``.
+    """
+    return take_pose(Reader(encode_pose(pose), "pose"))
+
+
 def encode_camera(camera: Camera) -> bytes:
     """Return the bytes of a camera.
 

@@ -29,7 +29,7 @@ _NOTHING_NEW = """
 import gc, cv2
 import vcl_companion.daemon.assemble
 from numba.core.dispatcher import Dispatcher
-from vcl_companion.mapping.warm_up import warm_up
+from vcl_companion.wire.warm_up import warm_up
 warm_up()
 kernels = [k for k in gc.get_objects() if isinstance(k, Dispatcher)]
 known = {k: len(k.signatures) for k in kernels}

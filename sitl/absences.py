@@ -1,0 +1,101 @@
+"""When a drone's daemon is not there: started late, killed in flight, started again."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from vcl_companion.errors import ConfigError
+
+_LATE_LIKE = "like mav2=8 (its daemon is started at second 8)"
+_KILL_LIKE = "like mav0=12 (killed at second 12), or mav0=12-20 (and started again at second 20)"
+_WHEN = re.compile(r"([0-9.]+)(?:-([0-9.]+))?")
+
+
+@dataclass(frozen=True)
+class Absence:
+    """A time in which the daemon of a drone does not run; its autopilot and its camera go on.
+
+    Attributes:
+        drone: ``mavN``.
+        from_s: when it is killed; a flight's seconds count from its first frame. 0: it was
+            not there from the start.
+        until_s: when it is started; infinite for never.
+    """
+
+    drone: str
+    from_s: float
+    until_s: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.from_s < self.until_s:
+            raise ConfigError(f"{self}: must be started after it is killed, {_KILL_LIKE}")
+
+    def __str__(self) -> str:
+        """Return the option that says so."""
+        if self.from_s == 0.0:
+            return f"--late {self.drone}={self.until_s:g}"
+        until = "" if math.isinf(self.until_s) else f"-{self.until_s:g}"
+        return f"--kill {self.drone}={self.from_s:g}{until}"
+
+
+def parse_late(text: str) -> Absence:
+    """Return what ``mav2=8`` says.
+
+    Raises:
+        ConfigError: it has another form.
+    """
+    drone, at_s, until_s = _drone_and_times(text)
+    if not drone or not 0.0 < at_s < math.inf or until_s is not None:
+        raise ConfigError(f"--late {text}: expected DRONE=SECOND above 0, {_LATE_LIKE}")
+    return Absence(drone, 0.0, at_s)
+
+
+def parse_kill(text: str) -> Absence:
+    """Return what ``mav0=12`` or ``mav0=12-20`` says.
+
+    Raises:
+        ConfigError: it has another form.
+    """
+    drone, at_s, until_s = _drone_and_times(text)
+    if not drone or not 0.0 < at_s < math.inf:
+        raise ConfigError(f"--kill {text}: expected DRONE=SECOND above 0, {_KILL_LIKE}")
+    return Absence(drone, at_s, math.inf if until_s is None else until_s)
+
+
+def check_absences(absences: Sequence[Absence], names: Sequence[str], duration_s: float) -> None:
+    """Raise ConfigError when absences do not go together, or not with a flight.
+
+    Args:
+        absences: all of them.
+        names: who flies.
+        duration_s: of the flight.
+    """
+    for absence in absences:
+        if absence.drone not in names:
+            raise ConfigError(f"{absence}: {absence.drone!r} does not fly ({', '.join(names)})")
+        last_s = absence.from_s if math.isinf(absence.until_s) else absence.until_s
+        if last_s >= duration_s:
+            raise ConfigError(f"{absence}: the flight is over after {duration_s:.1f} s")
+    ordered = sorted(absences, key=lambda absence: (absence.drone, absence.from_s))
+    for one, next_one in itertools.pairwise(ordered):
+        if one.drone == next_one.drone and next_one.from_s <= one.until_s:
+            raise ConfigError(f"{next_one}: is not running then, by {one}")
+    if {absence.drone for absence in absences if absence.from_s == 0.0} >= set(names):
+        raise ConfigError("--late: nobody is there from the start")
+
+
+def _drone_and_times(text: str) -> tuple[str, float, float | None]:
+    """Return name and seconds; NaN for what is none."""
+    drone, _, when = text.partition("=")
+    found = _WHEN.fullmatch(when.strip())
+    try:
+        if found:
+            until_s = None if found[2] is None else float(found[2])
+            return drone.strip(), float(found[1]), until_s
+    except ValueError:
+        pass
+    return drone.strip(), math.nan, None

@@ -1,0 +1,152 @@
+"""Drones that flew on maps of their own: what becomes of these, and of where they are."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from tests.daemon import demo
+from tests.daemon.swarm import Drone, swarm
+from tests.daemon.waiting import computed, hurry, run, until
+from vcl_companion.daemon.feature_memory import FeatureMemory
+from vcl_companion.daemon.map_branches import way_into
+from vcl_companion.daemon.map_building import update_map
+from vcl_companion.daemon.map_store import StoredMap
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.localization.map_index import index_map
+from vcl_companion.mapping.drone_view import encode_image
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
+
+PAIR, ALL = demo.encoded_map(1, 2), demo.encoded_map(1, 2, 3)
+
+
+def believed(drone: Drone) -> Pose:
+    """Where the autopilot is told that a drone is, at the instant of its clock."""
+    state = drone.estimator.predicted(drone.clock.now_ns(), None)
+    assert state is not None
+    return drone.estimator.local_from_world @ state.world_from_body
+
+
+def told_of(*drones: Drone) -> bool:
+    """Whether each knows what the others fly on."""
+    return all(
+        (state := one.group.state_of(other.system_id)) is not None and state.revision
+        for one in drones
+        for other in drones
+    )
+
+
+def test_a_map_of_another_world_is_merged_and_its_drone_goes_on_where_it_was(
+    tmp_path: Path,
+) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            one, two = [await members.start(s, flies_on=(1, 2)) for s in (1, 2)]
+            three = await members.start(3, flies_on=(1, 2, 3))
+            three.track(50)
+            before = believed(three)
+            await until(lambda: told_of(one, two, three))
+            hurry(6.0)  # the coordinator has not sent one of its own by then
+            await computed(lambda: one.revision not in (b"", revision_of(PAIR)))
+            merged = one.maps.current
+            assert merged is not None
+            assert merged.has_in_it(revision_of(ALL))
+            await computed(lambda: one.revision == two.revision == three.revision)
+            assert three.maps.current is not None
+            assert three.maps.current.world == merged.world == revision_of(PAIR)
+            assert one.events("merged")
+            assert three.events("world")
+            off = before.local(believed(three))
+            assert np.abs(off).max() < 1e-9
+            assert three.estimator.n_resets == 0
+            # The new world is not where the old one was, or this test shows nothing.
+            moved = three.estimator.local_from_world
+            assert np.abs(Pose.identity().local(moved)).max() > 1e-6
+
+    run(scenario())
+
+
+def branch(k: int) -> bytes:
+    """A map that was made from that of drones 1 and 2, with a later frame of each."""
+    stored = StoredMap(revision_of(PAIR), PAIR, demo.map_index(1, 2))
+    frames = [demo.answer(system_id, k) for system_id in (1, 2, 3)]
+    made = update_map(stored, frames, demo.MAP_OPTIONS, FeatureMemory(demo.FEATURES), at_once=False)
+    assert isinstance(made, LandmarkMap)
+    return encode_map(made)
+
+
+def test_what_both_parts_of_a_swarm_have_seen_meanwhile_is_kept(tmp_path: Path) -> None:
+    ours, theirs = demo.encoded_update(), branch(6)
+
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            one, two = [await members.start(s, runs=False) for s in (1, 2)]
+            three = await members.start(3, runs=False)
+            for drone, data in ((one, ours), (two, ours), (three, theirs)):
+                drone.maps.replace(PAIR, demo.map_index(1, 2))
+                drone.maps.replace(data, index_map(decode_map(data), "akaze", demo.FEATURES))
+                await members.begin(drone)
+                drone.track(50)
+            await until(lambda: told_of(one, two, three))
+            hurry(6.0)
+            await computed(lambda: one.revision not in (b"", revision_of(ours)))
+            await computed(lambda: one.revision == two.revision == three.revision)
+            merged = three.maps.current
+            assert merged is not None
+            assert merged.has_in_it(revision_of(theirs))
+            assert merged.parent == revision_of(ours)
+            seen = {(k.drone_id, k.captured_at_ns) for k in merged.index.landmark_map.keyframes}
+            assert {(3, demo.shot(3, k).at_ns) for k in (6, 12)} <= seen
+            assert not three.events("world")  # it is the same
+            assert np.abs(Pose.identity().local(three.estimator.local_from_world)).max() == 0.0
+
+    run(scenario())
+
+
+def elsewhere() -> bytes:
+    """The map of all three as it would be of another place: other pictures, the same numbers."""
+    landmark_map = decode_map(ALL)
+    rng = np.random.default_rng(3)
+    keyframes = []
+    for keyframe in landmark_map.keyframes:
+        size = keyframe.camera.height_px, keyframe.camera.width_px
+        noise = rng.integers(0, 255, size).astype(np.uint8)
+        image_bytes = encode_image(noise, 30)
+        keyframes.append(replace(keyframe, image_bytes=image_bytes, captured_at_ns=5))
+    return encode_map(replace(landmark_map, keyframes=tuple(keyframes)))
+
+
+def test_what_cannot_be_merged_stays_in_its_own_world_and_it_is_said_why(tmp_path: Path) -> None:
+    data = elsewhere()
+    index = index_map(decode_map(data), "akaze", demo.FEATURES)
+
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            one, two = [await members.start(s, flies_on=(1, 2)) for s in (1, 2)]
+            three = await members.start(3, runs=False)
+            three.maps.replace(data, index)
+            await members.begin(three)
+            three.track(50)
+            await until(lambda: told_of(one, two, three))
+            hurry(6.0)
+            await computed(lambda: bool(one.events("not merged")))
+            assert "landmarks" in one.events("not merged")[0]
+            # Handed the coordinator's, it does not fly on what it has no way into.
+            await computed(lambda: bool(three.exchange.refused["map that is not joined with ours"]))
+            assert three.revision == revision_of(data)
+            assert one.revision == two.revision == revision_of(PAIR)
+            await asyncio.sleep(0.1)
+            assert three.estimator.n_resets == 0
+
+    run(scenario())
+
+
+def test_there_is_a_way_within_a_world_and_where_a_map_was_joined() -> None:
+    pair = StoredMap(revision_of(PAIR), PAIR, demo.map_index(1, 2))
+    child = demo.encoded_update()
+    assert way_into(pair, decode_map(child), revision_of(child)) is None
+    assert isinstance(way_into(pair, decode_map(ALL), revision_of(ALL)), str)

@@ -1,0 +1,155 @@
+"""Maps that went apart: of parts of the swarm that were without each other for a while.
+
+Where each part has made a map of its own, neither is made from the other. Whoever flies on
+the one that does not go on hands it to who coordinates the other, and this one merges them
+(``mapping.merging``); until then it does not hand out its own, for what the others have seen
+would be lost with theirs. What cannot be merged stays as it is in another world; in the same
+world the coordinator's goes on, as if the other had never been. So it does for who is lost.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+from vcl_companion.daemon.map_offer import MapOffer
+from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.mapping.landmark_map import JoinedMap, LandmarkMap
+from vcl_companion.swarm.group import Group
+from vcl_companion.wire.header import BlobKind
+
+# A coordinator whose map we do not know is about to send it, as a rule.
+_SENDS_S = 5.0
+_MAX_REFUSED = 64
+
+
+class MapBranches:
+    """What one drone has to do with maps that went apart; see the module.
+
+    Args:
+        group: who is there.
+        maps: the current map.
+        is_receiving: whether a map is coming in.
+        wait_s: how long a coordinator waits for a map that it could merge.
+    """
+
+    def __init__(
+        self, group: Group, maps: MapStore, is_receiving: Callable[[], bool], wait_s: float
+    ) -> None:
+        self._group = group
+        self._maps = maps
+        self._is_receiving = is_receiving
+        self._wait_s = wait_s
+        self._given_by = group.own_id
+        self._refused: deque[bytes] = deque(maxlen=_MAX_REFUSED)
+        self._merged: dict[int, bytes] = {}  # of another team's coordinator, into ours
+        self._foreign_since_s: dict[int, tuple[bytes, float]] = {}
+
+    def given_by(self, peer: int) -> None:
+        """Note who has given us the map in use, ourselves perhaps."""
+        self._given_by = peer
+
+    def refused(self, revision: bytes) -> None:
+        """Note a map that cannot be merged with ours."""
+        self._refused.append(revision)
+
+    def merged(self, peer: int, revision: bytes) -> None:
+        """Note that a peer's map has been merged into ours."""
+        self._merged[peer] = revision
+
+    def is_awaited(self, peer: int, now_s: float) -> bool:
+        """Whether a teammate is not to be handed ours yet: it has one that we could merge."""
+        state = self._group.state_of(peer)
+        revision = b"" if state is None else state.revision
+        if not self._is_foreign(revision):
+            self._foreign_since_s.pop(peer, None)
+            return False
+        known, since_s = self._foreign_since_s.get(peer, (b"", now_s))
+        if known != revision:
+            since_s = now_s
+        self._foreign_since_s[peer] = revision, since_s
+        return now_s < since_s + self._wait_s
+
+    def receiver(self, now_s: float) -> int | None:
+        """Return whom to hand our map so that it is merged into its own; None for nobody."""
+        group, current = self._group, self._maps.current
+        if current is None or current.part_of:
+            return None
+        if group.is_coordinator:
+            seniors = [team for team in group.teams_met if group.is_senior(team)]
+            return group.coordinator_of(seniors[0]) if seniors else None
+        coordinator = group.coordinator
+        state = group.state_of(coordinator)
+        is_line_of_another = self._given_by != coordinator
+        if state is None or not (is_line_of_another and self._is_foreign(state.revision)):
+            self._foreign_since_s.pop(coordinator, None)
+            return None
+        _, since_s = self._foreign_since_s.setdefault(coordinator, (state.revision, now_s))
+        if now_s < since_s + _SENDS_S or self._is_receiving():
+            return None
+        is_first_holder = group.holders(current.revision)[:1] == (group.own_id,)
+        return coordinator if is_first_holder else None
+
+    def joining(self) -> tuple[int, ...]:
+        """Return the other teams' coordinators whose map ours has in it, to be handed ours."""
+        group, current = self._group, self._maps.current
+        if current is None:
+            return ()
+        teammates = group.teammates
+        gone = [peer for peer in self._merged if peer in teammates or peer not in group.alive]
+        for peer in gone:
+            del self._merged[peer]
+        return tuple(sorted(self._merged)) if group.is_coordinator else ()
+
+    def is_to_merge(self, peer: int, offer: MapOffer) -> bool:
+        """Whether a map that is offered to us as the coordinator is to be merged into ours."""
+        group, current = self._group, self._maps.current
+        if current is None or current.part_of or not group.is_coordinator:
+            return False
+        if offer.kind != BlobKind.MAP or offer.parent == current.revision:
+            return False
+        return self._is_foreign(offer.revision) and (
+            peer in group.teammates or self._is_of_junior_team(peer)
+        )
+
+    def comes_from_senior(self, peer: int) -> bool:
+        """Whether a peer coordinates a team that ours may join."""
+        team = self._group.team_of(peer)
+        is_other = team != self._group.team and self._group.is_senior(team)
+        return is_other and self._group.coordinator_of(team) == peer
+
+    def _is_of_junior_team(self, peer: int) -> bool:
+        team = self._group.team_of(peer)
+        return (
+            team in self._group.teams_met
+            and not self._group.is_senior(team)
+            and self._group.coordinator_of(team) == peer
+        )
+
+    def _is_foreign(self, revision: bytes) -> bool:
+        """Whether a revision is none of our line, nor in it, as far as known."""
+        current = self._maps.current
+        if not revision or current is None or revision in self._refused:
+            return False
+        if revision == current.revision or self._maps.has_left(revision):
+            return False
+        return not current.has_in_it(revision)
+
+
+def way_into(current: StoredMap, new: LandmarkMap, revision: bytes) -> JoinedMap | str | None:
+    """Say how a state on the map in use is carried over to another map.
+
+    Args:
+        current: the map in use.
+        new: the other one.
+        revision: of that.
+
+    Returns:
+        What says how; None where nothing has to be carried, both are of one world; a reason
+        where there is no way.
+    """
+    world = current.world
+    if new.world_of(revision) == world:
+        return None
+    ways = [joined for joined in new.joined if joined.world == world]
+    return ways[-1] if ways else "it is of another world, which ours was not joined with"
