@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -71,7 +72,10 @@ def test_a_swarm_in_flight_gets_a_new_map_and_nobody_jumps(tmp_path: Path) -> No
                 if switched_at and k >= switched_at + 6:
                     break
             assert 24 <= switched_at < 36
-            assert one.events("update")[0].startswith("wanted by drones 2, 3")
+            # Whose wishes have come by then is the machine's pace; that they are the most is not.
+            wanted = re.match(r"wanted by drones ([\d, ]+)", one.events("update")[0])
+            assert wanted is not None
+            assert len(wanted[1].split(", ")) >= 2
             second = one.revision
             for drone in drones:
                 assert drone.revision == second
