@@ -315,8 +315,10 @@ def test_frames_faster_than_they_can_be_localized_are_dropped_and_counted(tmp_pa
             await up.server.answered()
             counts = Counter(up.server.outcomes.values())
             assert sum(counts.values()) == 8
-            assert 2 <= counts["localized"] <= 7
-            assert counts["dropped"] == 8 - counts["localized"]
+            # On a machine that is busy one between may be too far from the last for patches.
+            looked_at = counts["localized"] + counts["refused"]
+            assert 2 <= counts["localized"] <= looked_at <= 7
+            assert counts["dropped"] == 8 - looked_at
             assert up.server.outcomes[7] == "localized"  # fresh beats complete
             assert up.log.frames == {"refused": 0, **counts}
             assert sorted(sequence for sequence, _, _ in up.frames()) == list(range(8))

@@ -275,7 +275,7 @@ def test_a_map_refused_once_is_taken_when_it_comes_from_the_coordinator(tmp_path
             two.say(MapState(revision_of(TRIO), 1, True, epoch=0x102), 3)
             two.forget()
             two.hand(BlobKind.MAP, TRIO, 3)
-            await passes_until(lambda: three.revision == revision_of(TRIO), 5.0)
+            await computed(lambda: three.revision == revision_of(TRIO))
 
     run(scenario())
 
