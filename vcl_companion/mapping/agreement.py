@@ -16,6 +16,7 @@ from vcl_companion.geometry.rotation import Array
 from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.uncertainty import MapUncertainty
+from vcl_companion.vision.information import squared_distances
 
 # Squared Mahalanobis distance that one in 10 000 exceeds, in six and in three dimensions.
 _CHI2_6, _CHI2_3 = 27.9, 21.1
@@ -145,7 +146,7 @@ def _moved_landmarks(
         return ""
     moved = new.points_world[now] - old.points_world[then]
     covariance = sure.marginal()[then] + _LEAST_M**2 * np.eye(3)
-    squared = np.einsum("ni,ni->n", moved, np.linalg.solve(covariance, moved[..., None])[..., 0])
+    squared = squared_distances(moved, covariance)
     metres = np.linalg.norm(moved, axis=1)
     # A landmark far behind the scene is known as badly as it is far.
     reaches_m = max(reach_m, _LEAST_M) + np.sqrt(np.trace(covariance, axis1=1, axis2=2))

@@ -20,7 +20,7 @@ from vcl_companion.mapping.common_landmarks import Common
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.uncertainty import MapUncertainty
-from vcl_companion.vision.information import covariance_of
+from vcl_companion.vision.information import covariance_of, squared_distances
 
 Mask = NDArray[np.bool_]
 
@@ -132,8 +132,7 @@ class _Pairs:
         apart = self.a - at.apply(self.b)
         covariance = self._of_a + turn @ self._of_b @ turn.T
         covariance += self._alike[:, None, None] * np.eye(3)
-        solved = np.linalg.solve(covariance, apart[..., None])[..., 0]
-        return np.asarray(np.einsum("ni,ni->n", apart, solved))
+        return squared_distances(apart, covariance)
 
     def once(self, at: Similarity, agree: Mask) -> NDArray[np.intp]:
         """Return pairs that agree, each landmark in its best one only."""
@@ -273,10 +272,8 @@ def _misfit(information: Array, residual: Array) -> tuple[Array, float]:
     number = np.arange(n)
     own = information.reshape(n, 3, n, 3)[number, :, number, :]
     pull = (information @ residual).reshape(n, 3)
-    solved = np.linalg.solve(
-        own + 1e-9 * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(3), pull[..., None]
-    )[..., 0]
-    return np.einsum("ni,ni->n", pull, solved), float(residual @ information @ residual)
+    own = own + 1e-9 * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    return squared_distances(pull, own), float(residual @ information @ residual)
 
 
 def _slope(at: Similarity, points: Array, centre: Array) -> Array:

@@ -14,6 +14,7 @@ from vcl_companion.mapping.growth import Growth
 from vcl_companion.mapping.landmark_map import KnownDistance, LandmarkMap
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
+from vcl_companion.vision.information import squared_distances
 
 # Squared Mahalanobis distance in three dimensions that one in 10 000 exceeds.
 _CHI2_3_9999 = 21.1
@@ -35,7 +36,7 @@ def broken_continuity(old: LandmarkMap, sure: MapUncertainty, growth: Growth) ->
     before = growth.old[stays]
     moved = growth.landmark_map.points_world[stays] - old.points_world[before]
     covariance = sure.marginal()[before]
-    squared = np.einsum("ni,ni->n", moved, np.linalg.solve(covariance, moved[..., None])[..., 0])
+    squared = squared_distances(moved, covariance)
     far = squared > _CHI2_3_9999
     if len(before) < 0.5 * len(old.points_world):
         return f"{len(before)} of {len(old.points_world)} old landmarks fit the new views"

@@ -24,14 +24,14 @@ from vcl_companion.mapping.known_features import Index
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.new_landmarks import Shown, free_of, new_landmarks, shown, with_room
 from vcl_companion.mapping.options import MapOptions
-from vcl_companion.mapping.patch_table import PatchTable, PyramidOf, Reference
+from vcl_companion.mapping.patch_table import PatchTable, PyramidOf, Reference, pyramids_of
 from vcl_companion.mapping.placing import Placed, place, references
 from vcl_companion.mapping.thinning import spread
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.mapping.uncertainty import MapUncertainty, views_of
 from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust
 from vcl_companion.vision.features import Detector, Features
-from vcl_companion.vision.patches import AlignRules, Pyramid
+from vcl_companion.vision.patches import AlignRules
 from vcl_companion.vision.resection import NotFound
 
 ImageFeatures = Callable[[bytes, Camera, Detector], Features]
@@ -94,7 +94,7 @@ class Extension:
         self._cameras = [v.camera for v in shown_by]
         self._images = [(v.image_bytes, v.camera) for v in shown_by]
         self._mountings = tuple(v.body_from_cam for v in shown_by)
-        self._table = PatchTable(self._cameras, [_read(pyramid_of, *i) for i in self._images])
+        self._table = PatchTable(self._cameras, pyramids_of(self._images, pyramid_of))
         self._relative = depth_errors(views_of(old))
         self.reasons: dict[int, str] = {}
 
@@ -287,13 +287,6 @@ class Extension:
 
     def _cams(self, table: Table) -> list[Pose]:
         return [b @ m for b, m in zip(table.bodies, self._mountings, strict=True)]
-
-
-def _read(pyramid_of: PyramidOf, image_bytes: bytes, camera: Camera) -> Pyramid | None:
-    try:
-        return pyramid_of(image_bytes, camera)
-    except ValueError:
-        return None
 
 
 def _seen_px(observed: Array, column: int) -> Array:

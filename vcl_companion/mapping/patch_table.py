@@ -8,7 +8,7 @@ surface is there; the view that it is cut from has no error by definition.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +44,19 @@ def decoded_pyramid(image_bytes: bytes, camera: Camera) -> Pyramid:
         ValueError: it is no image, or not one of this camera.
     """
     return pyramid_of(decode_image(image_bytes, camera))
+
+
+def pyramids_of(
+    images: Sequence[tuple[bytes, Camera]], pyramid_of: PyramidOf
+) -> list[Pyramid | None]:
+    """Return the pyramids of encoded images; None where the bytes are no image of that camera."""
+    out: list[Pyramid | None] = []
+    for image_bytes, camera in images:
+        try:
+            out.append(pyramid_of(image_bytes, camera))
+        except ValueError:
+            out.append(None)
+    return out
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,16 @@ import numpy as np
 from vcl_companion.mapping.culling import depth_errors, fitting
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions
-from vcl_companion.mapping.patch_table import PatchTable, PyramidOf, Reference, decoded_pyramid
+from vcl_companion.mapping.patch_table import (
+    PatchTable,
+    PyramidOf,
+    Reference,
+    decoded_pyramid,
+    pyramids_of,
+)
 from vcl_companion.mapping.uncertainty import views_of
 from vcl_companion.vision.bundle import BundleOptions, adjust
-from vcl_companion.vision.patches import AlignRules, Pyramid
+from vcl_companion.vision.patches import AlignRules
 
 # A first alignment starts from poses that are some pixels off, the next ones do not.
 _ROUNDS = (
@@ -40,23 +46,13 @@ def sharpened(
         pyramid_of: the image of a keyframe.
     """
     cameras = [k.camera for k in landmark_map.keyframes]
-    table = PatchTable(cameras, pyramids_of(landmark_map, pyramid_of))
+    images = [(k.image_bytes, k.camera) for k in landmark_map.keyframes]
+    table = PatchTable(cameras, pyramids_of(images, pyramid_of))
     for rules in _ROUNDS:
         landmark_map = _round(landmark_map, table, rules, options)
         if len(landmark_map.points_world) < options.min_landmarks:
             break
     return landmark_map
-
-
-def pyramids_of(landmark_map: LandmarkMap, pyramid_of: PyramidOf) -> list[Pyramid | None]:
-    """Return the images of a map's keyframes; None where the bytes are none."""
-    out: list[Pyramid | None] = []
-    for k in landmark_map.keyframes:
-        try:
-            out.append(pyramid_of(k.image_bytes, k.camera))
-        except ValueError:
-            out.append(None)
-    return out
 
 
 def _round(

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.aligning import Aligned, Side
 from vcl_companion.mapping.common_landmarks import shared_keyframes
@@ -22,10 +21,10 @@ from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.known_features import Index
 from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance
 from vcl_companion.mapping.options import MapOptions
-from vcl_companion.mapping.patch_table import PatchTable, PyramidOf
+from vcl_companion.mapping.patch_table import PatchTable, PyramidOf, pyramids_of
 from vcl_companion.mapping.placing import place
 from vcl_companion.mapping.uncertainty import views_of
-from vcl_companion.vision.patches import Pyramid
+from vcl_companion.vision.information import squared_distances
 from vcl_companion.vision.resection import NotFound
 
 # What lies so near to a landmark's patch is that landmark.
@@ -125,7 +124,9 @@ def _shown(
     known = senior.map
     all_of_them = known.keyframes + brought
     cameras = [k.camera for k in all_of_them]
-    table = PatchTable(cameras, [_read(pyramid_of, k.image_bytes, k.camera) for k in all_of_them])
+    table = PatchTable(
+        cameras, pyramids_of([(k.image_bytes, k.camera) for k in all_of_them], pyramid_of)
+    )
     cams = [k.world_from_body @ k.body_from_cam for k in known.keyframes]
     relative = depth_errors(views_of(known))
     out = np.full((len(known.points_world), len(brought), 2), np.nan)
@@ -168,8 +169,7 @@ def _explains(senior: Side, junior: Side, stands: Aligned) -> Callable[[Index, I
     def explained(one: Index, other: Index) -> Mask:
         apart = senior.map.points_world[one] - at.apply(junior.map.points_world[other])
         covariance = of_a[one] + turn @ of_b[other] @ turn.T
-        solved = np.linalg.solve(covariance, apart[..., None])[..., 0]
-        return np.asarray(np.einsum("ni,ni->n", apart, solved) < _CHI2_3_999)
+        return squared_distances(apart, covariance) < _CHI2_3_999
 
     return explained
 
@@ -222,10 +222,3 @@ def _with_junior(
         np.concatenate([senior.map.points_world, points]),
         row,
     )
-
-
-def _read(pyramid_of: PyramidOf, image_bytes: bytes, camera: Camera) -> Pyramid | None:
-    try:
-        return pyramid_of(image_bytes, camera)
-    except ValueError:
-        return None

@@ -31,6 +31,20 @@ def covariance_of(information: Array, least_eigenvalue: float) -> Array | None:
     return np.asarray(0.5 * (out + np.swapaxes(out, -1, -2)))
 
 
+def squared_distances(apart: Array, covariance: Array) -> Array:
+    """Return (N,) squared Mahalanobis distances.
+
+    Args:
+        apart: (N, K) differences.
+        covariance: (N, K, K) of each, positive definite.
+
+    Raises:
+        numpy.linalg.LinAlgError: one of them is singular.
+    """
+    solved = np.linalg.solve(covariance, apart[..., None])[..., 0]
+    return np.asarray(np.einsum("nk,nk->n", apart, solved))
+
+
 def is_covariance(matrix: Array) -> bool:
     """Whether a (K, K) matrix is finite, symmetric and has no negative eigenvalue."""
     if not (np.all(np.isfinite(matrix)) and np.array_equal(matrix, matrix.T)):
