@@ -269,6 +269,18 @@ class MapRounds:
         self, newest: Frame, wanted: Wanted, is_over: Callable[[], bool]
     ) -> list[FrameAnswer] | NoMap:
         """Return our own frames and those of the others, or why ours cannot be used."""
+        began_s = self._now_s()
+        async with asyncio.TaskGroup() as group:  # ours are encoded while the others' come
+            ours = group.create_task(self._own(newest, wanted))
+            theirs = group.create_task(self._gathering.gather(wanted, is_over))
+        described = ours.result()
+        if isinstance(described, NoMap):
+            return described
+        gathered = described + theirs.result()
+        _log.info("%d frames gathered in %.1f s", len(gathered), self._now_s() - began_s)
+        return gathered
+
+    async def _own(self, newest: Frame, wanted: Wanted) -> list[FrameAnswer] | NoMap:
         own = [newest]
         for n in range(1, 1 + wanted.earlier.get(self._group.own_id, 0)):
             earlier = self._frames.nearest(wanted.instant_ns(n))
@@ -281,10 +293,7 @@ class MapRounds:
         if self._is_updating:
             for answer in described:
                 self._passed.pass_on(answer)
-        began_s = self._now_s()
-        gathered = described + await self._gathering.gather(wanted, is_over)
-        _log.info("%d frames gathered in %.1f s", len(gathered), self._now_s() - began_s)
-        return gathered
+        return described
 
     async def _built(
         self,

@@ -81,10 +81,10 @@ class UpdateOptions:
     share: float = 0.6
     covered: float = 0.7
     novelty_deg: float = 5.0
-    ahead_s: float = 1.5
+    ahead_s: float = 2.0
     sigma_m: float = 0.005
     sigma_growth: float = 1.5
-    hold_s: float = 0.3
+    hold_s: float = 0.1
     interval_s: float = 0.5
     gather_timeout_s: float = 5.0
     delivery_wait_s: float = 30.0
