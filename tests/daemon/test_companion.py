@@ -369,22 +369,43 @@ def test_a_newer_frame_ends_the_wait_for_the_next_map(tmp_path: Path) -> None:
     run(scenario())
 
 
-def test_a_frame_that_is_looked_for_keeps_none_waiting_and_counts_when_found(
-    tmp_path: Path,
-) -> None:
+def test_a_frame_that_is_looked_for_leads_those_that_came_meanwhile(tmp_path: Path) -> None:
     async def scenario() -> None:
         async with flying(tmp_path) as up:
             up.fly_on_a_map()
             up.shop.is_open.clear()
-            for k, shot in enumerate(demo.shot(DRONE, k) for k in range(3)):
+            for k, shot in enumerate(demo.shot(DRONE, k) for k in range(4)):
                 up.give(k)
                 await until(partial(up.estimator.has_looked_at, shot.at_ns))
-            await until(lambda: 1 in up.server.outcomes)
-            assert up.frames() == [(1, "refused", "lost, and not looked for again yet")]
-            # It leads the newest of those that followed it.
+            assert up.frames() == []
+            assert up.estimator.seen_on == b""  # what the map lacks cannot be said yet
             up.shop.is_open.set()
             await up.server.answered()
-            assert sorted(up.frames()[1:]) == [(0, "localized", None), (2, "localized", None)]
+            assert sorted(up.frames()) == [(k, "localized", None) for k in range(4)]
+            assert up.estimator.seen_on != b""
+            # Which speed that is nobody knew before; the next one is found at once.
+            up.shop.is_open.clear()
+            up.give(4)
+            await up.server.answered()
+            assert up.frames()[-1] == (4, "localized", None)
+
+    run(scenario())
+
+
+def test_of_many_frames_that_came_during_a_search_every_second_is_let_go(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            up.shop.is_open.clear()
+            for k, shot in enumerate(demo.shot(DRONE, k) for k in range(20)):
+                up.give(k)
+                await until(partial(up.estimator.has_looked_at, shot.at_ns))
+            await until(lambda: len(up.frames()) == 8)
+            reason = "lost, and not looked for again yet"
+            assert up.frames() == [(k, "refused", reason) for k in range(2, 18, 2)]
+            up.shop.is_open.set()
+            await up.server.answered()
+            assert [up.server.outcomes[k] for k in (0, 1, 3, 17, 18, 19)] == ["localized"] * 6
 
     run(scenario())
 

@@ -17,7 +17,7 @@ from vcl_companion.daemon.flight_log import Basis, FlightLog, PoseSource
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.inter_target import Asked, InterTarget
-from vcl_companion.daemon.mailbox import Mailbox
+from vcl_companion.daemon.mailbox import FramesBehind, Mailbox
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.geometry.rotation import Array
@@ -41,6 +41,9 @@ _FALL_BACK_EVERY_S = 1.0
 # A search in vain that took longer than frames are apart is not begun again before so many
 # times as long: on a small board the map that it needs would else never be made.
 _PAUSE_AFTER_VAIN = 1.0
+_PATCHES_ALONE = Effort(may_search=False, may_doubt=False)
+# A third of a megabyte each.
+_MAX_BEHIND = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +82,8 @@ class Companion:
     """Takes the newest frame, localizes it, sends the pose; one frame at a time.
 
     A frame that has to be looked for by its features takes as long as ten others: it is, and
-    is answered, beside those that follow it.
+    is answered, beside those that follow it. These are followed from where it was, one after
+    the other up to the newest: by then that one is too far from it to be found at once.
 
     Args:
         camera: where frames come from.
@@ -138,6 +142,8 @@ class Companion:
         self._searched: StoredMap | None = None
         self._search_over = asyncio.Event()
         self._search_over.set()
+        self._sought_at_ns = -1
+        self._behind: FramesBehind[NotLocalized] = FramesBehind(_MAX_BEHIND)
 
     async def read_camera(self) -> None:
         """Move frames from the camera to the mailbox until the stream ends and all are answered.
@@ -215,15 +221,40 @@ class Companion:
         Returns:
             What they are asked; None when nobody is and the frame is answered.
         """
-        at_ns = frame.captured_at_ns
-        attitude = await self._autopilot.attitude_at(at_ns, ATTITUDE_WAIT_S)
-        ned_from_body = None if attitude is None else attitude.ned_from_body
+        ned_from_body = await self._attitude_of(frame)
         now_s = asyncio.get_running_loop().time()
         follows = stored.templates is not None
         may_doubt = now_s >= self._doubted_at_s + _DOUBT_EVERY_S
         effort = Effort(may_search=not follows, may_doubt=may_doubt)
-        predicted = self._estimator.predicted(at_ns, ned_from_body)
-        fix = await asyncio.get_running_loop().run_in_executor(
+        fix = await self._looked_at(frame, stored, ned_from_body, effort)
+        if isinstance(fix, Localized) and is_doubtful(fix):
+            self._doubted_at_s = now_s
+        refused = self._take(frame, fix, ned_from_body)
+        if isinstance(fix, Localized) or not follows:
+            self._estimator.seen_on = stored.revision
+        if isinstance(fix, NotLocalized) and follows:
+            if self._is_searching:
+                # What is found there leads this frame too, if it is still the newest then.
+                await self._unless_newer(frame, self._search_over.wait())
+                if not (self._is_searching or self._mailbox.has_had_newer(frame)):
+                    return await self._localize(frame, self._maps.current or stored)
+            elif stored is not self._searched or now_s >= self._search_again_at_s:
+                self._search_over.clear()
+                self._sought_at_ns = frame.captured_at_ns
+                may_fall_back = now_s >= self._fell_back_at_s + _FALL_BACK_EVERY_S
+                return _Sought(frame, ned_from_body, stored, may_fall_back)
+        return await self._ask(frame, ned_from_body, stored, refused)
+
+    async def _attitude_of(self, frame: Frame) -> Array | None:
+        attitude = await self._autopilot.attitude_at(frame.captured_at_ns, ATTITUDE_WAIT_S)
+        return None if attitude is None else attitude.ned_from_body
+
+    async def _looked_at(
+        self, frame: Frame, stored: StoredMap, ned_from_body: Array | None, effort: Effort
+    ) -> Localized | NotLocalized:
+        """Return what a frame gives from where the drone is believed to have been then."""
+        predicted = self._estimator.predicted(frame.captured_at_ns, ned_from_body)
+        return await asyncio.get_running_loop().run_in_executor(
             self._executor,
             localize,
             frame.image,
@@ -236,46 +267,62 @@ class Companion:
             self._options,
             effort,
         )
-        if isinstance(fix, Localized) and is_doubtful(fix):
-            self._doubted_at_s = now_s
-        refused = self._take(frame, fix, ned_from_body)
-        self._estimator.seen_on = stored.revision
-        if isinstance(fix, NotLocalized) and follows:
-            if self._is_searching:
-                # What is found there leads this frame too, if it is still the newest then.
-                await self._unless_newer(frame, self._search_over.wait())
-                if not (self._is_searching or self._mailbox.has_had_newer(frame)):
-                    return await self._localize(frame, self._maps.current or stored)
-            elif stored is not self._searched or now_s >= self._search_again_at_s:
-                self._search_over.clear()
-                may_fall_back = now_s >= self._fell_back_at_s + _FALL_BACK_EVERY_S
-                return _Sought(frame, ned_from_body, stored, may_fall_back)
-        return await self._ask(frame, ned_from_body, stored, refused)
 
     @property
     def _is_searching(self) -> bool:
         return not self._search_over.is_set()
 
     async def _search(self, sought: _Sought) -> _AskedPeers | _Sought | None:
-        """Look for a frame by its features; the rest is as for any other."""
-        frame, stored = sought.frame, sought.stored
-        began_s = asyncio.get_running_loop().time()
-        effort = Effort(may_track=False, may_fall_back=sought.may_fall_back)
-        predicted = self._estimator.predicted(frame.captured_at_ns, sought.ned_from_body)
-        prior = predicted.prior() if predicted else None
+        """Look for a frame by its features; the rest is as for any other.
+
+        What comes meanwhile is kept, and followed from where this one is found.
+        """
+        frame = sought.frame
         try:
+            stored, fix = await self._found(sought)
+            refused = self._take(frame, fix, sought.ned_from_body)
+            self._estimator.seen_on = stored.revision
+            while refused is None and (behind := self._behind.take()) is not None:
+                await self._look_again(*behind)
+        finally:
+            self._search_over.set()
+            while (behind := self._behind.take()) is not None:
+                self._give_up(*behind)
+        return await self._ask(frame, sought.ned_from_body, stored, refused)
+
+    async def _found(self, sought: _Sought) -> tuple[StoredMap, Localized | NotLocalized]:
+        """Return what the features of a frame say, and of which map: of a newer one if that came.
+
+        A map that was made because the last one ended here comes while that is searched in vain.
+        """
+        frame, stored = sought.frame, sought.stored
+        effort = Effort(may_track=False, may_fall_back=sought.may_fall_back)
+        while True:
+            began_s = asyncio.get_running_loop().time()
+            predicted = self._estimator.predicted(frame.captured_at_ns, sought.ned_from_body)
+            prior = predicted.prior() if predicted else None
             fix = await self._work.find(
                 np.asarray(frame.image), stored, prior, sought.ned_from_body, effort
             )
-        finally:
-            self._search_over.set()
-        if isinstance(fix, NotLocalized):
+            if isinstance(fix, Localized):
+                return stored, fix
             self._searched_in_vain(frame, stored, began_s)
             if sought.may_fall_back and stored.index.fallback is not None:
                 self._fell_back_at_s = began_s
-        refused = self._take(frame, fix, sought.ned_from_body)
-        self._estimator.seen_on = stored.revision
-        return await self._ask(frame, sought.ned_from_body, stored, refused)
+            if self._maps.current is None or self._maps.current is stored:
+                return stored, fix
+            stored = self._maps.current
+
+    async def _look_again(self, frame: Frame, refused: NotLocalized) -> None:
+        """Answer a frame by what is known by now of where it was taken: later ones have been."""
+        stored = self._maps.current
+        if stored is not None and stored.templates is not None:
+            ned_from_body = await self._attitude_of(frame)
+            fix = await self._looked_at(frame, stored, ned_from_body, _PATCHES_ALONE)
+            if self._take(frame, fix, ned_from_body) is None:
+                self._outcomes.close(frame)
+                return
+        self._give_up(frame, refused)
 
     async def _ask(
         self,
@@ -305,12 +352,22 @@ class Companion:
     async def _given_up(
         self, frame: Frame, stored: StoredMap, refused: NotLocalized
     ) -> _Sought | _AskedPeers | None:
-        """Answer a frame that nobody could place, unless a newer map comes that may place it."""
+        """Answer a frame that nobody could place, unless something comes that may place it.
+
+        That is a newer map, or, where an older frame is still looked for, its place.
+        """
+        if self._is_searching and frame.captured_at_ns > self._sought_at_ns:
+            for let_go in self._behind.keep(frame, refused):
+                self._give_up(*let_go)
+            return None
         self._health.refused(refused.reason)
         newer = await self._next_map(frame, stored)
         if newer is not None:
             return await self._localize(frame, newer)
-        self._give_up(frame, refused)
+        if self._mailbox.has_had_newer(frame):
+            await self._look_again(frame, refused)
+        else:
+            self._give_up(frame, refused)
         return None
 
     def _take(
@@ -408,6 +465,7 @@ class Companion:
         Not when the autopilot has heard of a later frame: a pose of the past that
         nobody has measured is no news.
         """
+        self._health.refused(why.reason)
         at_ns = frame.captured_at_ns
         state = self._estimator.coasted_at(at_ns) if at_ns > self._sent_at_ns else None
         coasted = state is not None and self._autopilot.send_pose(

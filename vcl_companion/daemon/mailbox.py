@@ -44,6 +44,34 @@ class Mailbox:
         return frame
 
 
+class FramesBehind(Generic[_Item]):
+    """Holds frames that came while an older one is looked for, in their order.
+
+    From where that one is found they are followed to the newest one. Of too many every second
+    is let go: what is left is still not far apart.
+
+    Args:
+        at_most: so many.
+    """
+
+    def __init__(self, at_most: int) -> None:
+        self._at_most = at_most
+        self._frames: list[tuple[Frame, _Item]] = []
+
+    def keep(self, frame: Frame, why: _Item) -> list[tuple[Frame, _Item]]:
+        """Keep a frame and why it waits; return those that were let go for it."""
+        self._frames.append((frame, why))
+        self._frames.sort(key=lambda kept: kept[0].captured_at_ns)
+        if len(self._frames) <= self._at_most:
+            return []
+        let_go, self._frames = self._frames[1::2], self._frames[::2]
+        return let_go
+
+    def take(self) -> tuple[Frame, _Item] | None:
+        """Take the oldest one out; None when there is none."""
+        return self._frames.pop(0) if self._frames else None
+
+
 class PeerMailbox(Generic[_Item]):
     """Holds the newest thing of each peer; peers are served in turn.
 
