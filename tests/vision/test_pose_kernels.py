@@ -77,7 +77,7 @@ def test_the_same_pose_and_covariance_as_the_refinement_in_arrays(camera: Camera
     assert np.array_equal(agrees.astype(bool), expected.inliers)
     n = len(agrees)
     assert np.isclose(np.sqrt(information[-1, 0] / agrees.sum()), expected.rms_px)
-    levers = rng.standard_normal((n, 3, 12))
+    levers = rng.standard_normal((n, 3, 12)).astype(np.float32)
     own = rng.standard_normal((n, 3))
     leverage, parts, lever = gained(
         agrees, np.linalg.inv(normal), j_pose, j_point, information,

@@ -14,7 +14,11 @@ _PROC = Path("/proc")
 _MAPS = _PROC / "self/smaps"
 _MADV_DONTNEED = 4  # <linux/mman.h>, the same on all architectures but alpha
 _WORTH_KB = 256
-_ARENA_MAX = -8  # <malloc.h>
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # <malloc.h>
+# Blocks of so much go back to the system when they are freed, as does so much at the heap's end.
+# Left to itself glibc raises the first to the largest block that was ever freed, 32 MB at most,
+# and what a detector needs for a moment stays.
+_LARGE_BYTES, _KEPT_BYTES = 1 << 20, 4 << 20
 # Changed pages, those of relocated tables say, would come back as the file has them.
 _CHANGED = ("Private_Dirty:", "Shared_Dirty:", "Anonymous:")
 
@@ -77,10 +81,14 @@ def share_freed() -> None:
     """Let threads use what others have freed (glibc); call it before there are any.
 
     Otherwise each keeps what it needed most for itself, and making a map, recognising
-    a frame and answering a peer take a hundred megabytes one after the other.
+    a frame and answering a peer take a hundred megabytes one after the other. Large blocks
+    are given back to the system at once.
     """
     with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
+        libc = ctypes.CDLL(None)
+        libc.mallopt(_ARENA_MAX, 1)
+        libc.mallopt(_MMAP_THRESHOLD, _LARGE_BYTES)
+        libc.mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
 
 
 def give_back_freed() -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import adjoint
 from vcl_companion.geometry.rotation import Array
@@ -45,7 +46,7 @@ class MapUncertainty:
 
     keyframe_covariance: Array
     landmark_covariance: Array
-    landmark_lever: Array
+    landmark_lever: NDArray[np.float32]
 
     def marginal(self) -> Array:
         """Return (N, 3, 3) the whole covariance of each landmark, m^2."""
@@ -89,8 +90,9 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
         scaled = replace(views, slopes=views.slopes / noise_px)
         system = normal_equations(scaled, None)
         inverse = _inverse(system.point_block)
-        # In the order in which compiled loops were compiled for it.
-        lever = np.ascontiguousarray(-np.swapaxes(system.cross @ inverse, 1, 2))
+        # In the order in which compiled loops were compiled for it. It is the largest part of a
+        # map of many keyframes, and a millionth of it is no matter.
+        lever = np.ascontiguousarray(-np.swapaxes(system.cross @ inverse, 1, 2), dtype=np.float32)
         reduced = system.pose_block - eliminated(system.cross, inverse, system.seen)
         covariance = np.zeros_like(reduced)
         covariance[6:, 6:] = _inverse(reduced[6:, 6:])

@@ -165,7 +165,7 @@ def gained(
     misplaced: Array,
     owns: Array,
     landmarks: Ints,
-    levers: Array,
+    levers: NDArray[np.float32],
 ) -> tuple[Array, Array, Array]:
     """Carry the errors of everything that fixed a pose over to it (eq. 12, and the map's).
 

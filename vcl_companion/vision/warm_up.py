@@ -117,5 +117,5 @@ def _track(rng: np.random.Generator) -> None:
         found.misplaced,
         anchors.own[rows],
         rows,
-        np.zeros((n, 3, 6)),
+        np.zeros((n, 3, 6), np.float32),
     )
