@@ -208,6 +208,22 @@ def test_the_stated_covariance_holds() -> None:
     assert 1.0 < np.median(own) < 18.0
 
 
+def test_a_lens_that_is_off_does_not_average_out(
+    rng: np.random.Generator, templates: Templates
+) -> None:
+    """However many landmarks agree on it, the image of another centre is taken to be turned."""
+    off = replace(PINHOLE, cx_px=PINHOLE.cx_px + 0.1, cy_px=PINHOLE.cy_px - 0.1)
+    image, prior = photograph(TRUTH, rng), near(rng, TRUTH)
+    own = []
+    for shifted_px in (1e-3, 0.1):
+        options = replace(OPTIONS, shifted_px=shifted_px)
+        fix = tracked(image, templates, prior, off, options)
+        error = TRUTH.local(fix.world_from_body)
+        own.append(nees(error, fix.noise_covariance + fix.own_map_covariance)[0])
+    assert own[0] > 50.0
+    assert own[1] < 20.0
+
+
 def test_few_landmarks_are_as_many_as_wanted(
     rng: np.random.Generator, templates: Templates
 ) -> None:
@@ -267,6 +283,7 @@ def test_the_same_frame_gives_the_same_pose(rng: np.random.Generator, templates:
         {"least_score": 1.0},
         {"max_radius_px": 0.0},
         {"misplaced_px": -1.0},
+        {"shifted_px": 0.0},
     ],
 )
 def test_options_out_of_bounds_are_refused(wrong: dict[str, float]) -> None:

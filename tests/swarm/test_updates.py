@@ -49,11 +49,11 @@ def test_one_bad_frame_changes_nothing() -> None:
 
 
 def test_who_will_have_lost_half_when_an_update_is_there_votes_before() -> None:
-    """Sixty landmarks a second: below 0.6 of 400 after 2.7 s, foreseen 1.5 s before."""
+    """Sixty landmarks a second: below 0.6 of 400 after 2.7 s, foreseen as far as that is a course."""
     falling = [PLENTY] * 20 + [PLENTY - 6 * k for k in range(40)]
     votes = [voted(falling[: 20 + k]) for k in range(1, 40)]
-    assert not any(votes[:11])
-    assert all(votes[18:])
+    assert not any(votes[:9])
+    assert all(votes[12:])
     # A course that is none: a step, however steep, and coming and going.
     assert not voted([PLENTY] * 20 + [PLENTY - 100] * 10)
     assert not any(voted([PLENTY - 50 * (k % 3 == n % 3) for k in range(n)]) for n in range(1, 40))

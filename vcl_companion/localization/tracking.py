@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vcl_companion.geometry.camera import Camera
-from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.pose import Pose, adjoint
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.coverage import covered_share, novelty_deg
 from vcl_companion.localization.intra import (
@@ -58,6 +58,9 @@ class TrackingOptions:
         misplaced_px_per_deg: per angle between the lines of sight of frame and keyframe.
         misplaced_px_per_octave: per doubling or halving of the distance.
         misplaced_by_residual: per sigma that the residual of the grey levels explains.
+        shifted_px: what all alignments of an image are off together, in each direction: no lens
+            is known better, nor what a patch's surface, its light and an encoder do to it. However
+            many landmarks there are, this does not average out.
     """
 
     n_landmarks: int = 400
@@ -70,6 +73,7 @@ class TrackingOptions:
     misplaced_px_per_deg: float = 0.009
     misplaced_px_per_octave: float = 0.03
     misplaced_by_residual: float = 0.7
+    shifted_px: float = 0.05
 
     def __post_init__(self) -> None:
         if not 20 <= self.n_coarse <= self.n_landmarks:
@@ -86,6 +90,7 @@ class TrackingOptions:
             "misplaced_px_per_deg",
             "misplaced_px_per_octave",
             "misplaced_by_residual",
+            "shifted_px",
         ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
@@ -277,7 +282,7 @@ class _Tracker:
         fix = Localized(
             pose,
             _ROBUST_LOSS * by_noise,
-            _ROBUST_LOSS * by_misplacement + by_landmarks,
+            _ROBUST_LOSS * by_misplacement + by_landmarks + self._by_shift(),
             lever,
             uncertainty.keyframe_covariance,
             n_tried,
@@ -291,6 +296,13 @@ class _Tracker:
             self._novelty_deg(found.anchors[agrees > 0], pose),
         )
         return believed(fix, ned_from_body, self._belief)
+
+    def _by_shift(self) -> Array:
+        """Return the pose's (6, 6) covariance by a shift of the whole image: the camera, turned."""
+        turned = adjoint(self._mounting)[:, 3:5]
+        return np.asarray(
+            (self._options.shifted_px / self._camera.focal_px) ** 2 * turned @ turned.T
+        )
 
     def _novelty_deg(self, anchors: NDArray[np.int64], pose: Pose) -> float:
         centres = np.stack([p.translation for p in self._anchors.images.worlds_from_cams])
