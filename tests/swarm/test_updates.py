@@ -49,7 +49,7 @@ def test_one_bad_frame_changes_nothing() -> None:
 
 
 def test_who_will_have_lost_half_when_an_update_is_there_votes_before() -> None:
-    """Sixty landmarks a second: below 0.6 of 400 after 2.7 s, foreseen as far as that is a course."""
+    """Sixty landmarks a second: below 0.6 of 400 after 2.7 s, foreseen when that is a course."""
     falling = [PLENTY] * 20 + [PLENTY - 6 * k for k in range(40)]
     votes = [voted(falling[: 20 + k]) for k in range(1, 40)]
     assert not any(votes[:9])

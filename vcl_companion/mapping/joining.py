@@ -112,14 +112,10 @@ def sightings_of(
 ) -> Sightings:
     """Return what a view sees of a map's landmarks, each with its whole covariance."""
     ideal = view.camera.ideal_from_pixels(view.pixels[links.b])
-    shared = sure.landmark_lever[links.a] @ sure.keyframe_covariance
-    marginal = sure.landmark_covariance[links.a] + shared @ np.swapaxes(
-        sure.landmark_lever[links.a], 1, 2
-    )
     return Sightings(
         ideal,
         known.points_world[links.a],
-        marginal,
+        sure.for_matching(links.a),
         view.camera.focal_px,
         view.camera.pixel_slopes(ideal),
         view.body_from_cam,

@@ -172,12 +172,10 @@ def _sightings(
     noise_px: float,
 ) -> Sightings:
     ideal = view.camera.ideal_from_pixels(pixels)
-    lever = sure.landmark_lever[landmarks]
-    shared = lever @ sure.keyframe_covariance
     return Sightings(
         ideal,
         known.points_world[landmarks],
-        sure.landmark_covariance[landmarks] + shared @ np.swapaxes(lever, 1, 2),
+        sure.for_matching(landmarks),
         view.camera.focal_px,
         view.camera.pixel_slopes(ideal),
         view.body_from_cam,

@@ -30,6 +30,8 @@ _SINGULAR = 1e-11
 # of a map to the next it does not change its sign: what an extension adds to the error grows with
 # how many there were before. NEES of keyframes rose so on rendered flights and on photographs.
 SHARED_NOISE_PX = 0.28
+_GROWTH = 1.5
+_WIDER = 1.5
 # No distance between drones is known better; much smaller sigmas overflow.
 _FINEST_M = 1e-6
 
@@ -52,6 +54,16 @@ class MapUncertainty:
         """Return (N, 3, 3) the whole covariance of each landmark, m^2."""
         shared = self.landmark_lever @ self.keyframe_covariance
         return self.landmark_covariance + shared @ np.swapaxes(self.landmark_lever, 1, 2)
+
+    def for_matching(self, landmarks: NDArray[np.intp]) -> Array:
+        """Return (M, 3, 3) covariances that tell sightings of some landmarks from wrong ones.
+
+        The error that they share is taken for more than it is: where a wide step ends a map, all
+        new views hang on the few landmarks that such a gate lets in.
+        """
+        lever = self.landmark_lever[landmarks]
+        shared = _WIDER**2 * lever @ self.keyframe_covariance
+        return self.landmark_covariance[landmarks] + shared @ np.swapaxes(lever, 1, 2)
 
 
 def views_of(landmark_map: LandmarkMap) -> Views:
@@ -108,7 +120,7 @@ def _noise_px(landmark_map: LandmarkMap) -> Array:
     """Return (V,) noise of the observations in each keyframe, px, 1 sigma."""
     times = [k.captured_at_ns for k in landmark_map.keyframes]
     generation = np.searchsorted(np.unique(times), times)
-    shared_px = SHARED_NOISE_PX * np.sqrt(1.0 + 3.0 * generation)
+    shared_px = SHARED_NOISE_PX * np.sqrt(1.0 + _GROWTH * generation)
     return np.asarray(np.hypot(landmark_map.pixel_noise_px, shared_px))
 
 
