@@ -29,6 +29,7 @@ from vcl_companion.daemon.map_rounds import MapRounds, RoundOptions
 from vcl_companion.daemon.map_sharing import MapSharing
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.own_state import OwnState
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.daemon.peer_clocks import PeerClocks
 from vcl_companion.daemon.peer_trust import PeerTrust
@@ -52,25 +53,18 @@ from vcl_companion.swarm.transfer import (
     TransferFailed,
     Transfers,
 )
-from vcl_companion.swarm.updates import OwnVote, Sight, UpdateOptions
+from vcl_companion.swarm.updates import UpdateOptions
 from vcl_companion.swarm.urgency import Message
 from vcl_companion.vision.features import Detector
 from vcl_companion.wire.chunks import Chunk, TransferStatus, describe
 from vcl_companion.wire.frame_codec import decode_frame
 from vcl_companion.wire.header import VersionMismatchError
-from vcl_companion.wire.messages import MAX_TRACKED, FrameRequest, MapRefused, MapState
+from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
 from vcl_companion.wire.pose_messages import PoseProposal, PoseRefused
 from vcl_companion.wire.tunnel import TunnelPayload, decode_payload, is_ours
 
 _log = logging.getLogger(__name__)
 
-_STATE_INTERVAL_S = 1.0
-# Nothing new to tell: that we are there the heartbeats say.
-_STATE_AT_REST_S = 2.0
-# So much more or less of the map in sight is news.
-_NEWS_SHARE = 0.1
-# Who joins is told soon, and all who join meanwhile with it: a group starts at one time.
-_STATE_TO_NEW_S = 0.2
 _STEP_S = 0.1
 _SIGNATURE_S = 2.0
 
@@ -182,6 +176,9 @@ class Exchange:
             RoundOptions(options.map, options.update),
             rng,
         )
+        self._own_state = OwnState(
+            system_id, group, maps, estimator, clock, log, options.update, self._send
+        )
         self._sharing = MapSharing(
             group,
             transfers,
@@ -189,7 +186,7 @@ class Exchange:
             log,
             work,
             disk,
-            self._tell_state,
+            self._own_state.tell,
             self._refusals.count,
             self.trust,
             self._passed,
@@ -225,9 +222,6 @@ class Exchange:
             options.detectors,
             tries_all=options.tracked,
         )
-        self._vote = OwnVote(options.update)
-        self._wants_update = False
-        self._has_joined = False  # somebody, who has not been told our state since
         self._wake = asyncio.Event()
 
     @property
@@ -293,19 +287,11 @@ class Exchange:
             parts.create_task(self._keep_going())
 
     async def _keep_going(self) -> None:
-        told_at_s, told_lead = float("-inf"), (0, 0)
         while True:
             now_s = self._now_s()
             self._note(self._group.poll(now_s))
             self._review()
-            interval_s = _STATE_TO_NEW_S if self._has_joined else self._state_interval_s()
-            lead = self._group.team, self._group.own_epoch
-            if lead[0] != told_lead[0]:
-                self._log.event("team", f"of drone {lead[0]}" if lead[0] else "of all")
-            if self._voted(now_s) or lead != told_lead or now_s - told_at_s >= interval_s:
-                told_at_s, told_lead = now_s, lead
-                self._has_joined = False
-                self._tell_state()
+            self._own_state.poll(now_s)
             self._sharing.handing.hand_out(now_s)
             self._poll_transfers()
             due_s = self._transfers.next_poll_s()
@@ -445,48 +431,6 @@ class Exchange:
         self._wake.set()
         return self._transfers.submit(peer, kind, blob, self._now_s())
 
-    def _voted(self, now_s: float) -> bool:
-        """Look at what we see of the map; whether our vote for an update has changed."""
-        stored = self._maps.current
-        before = self._wants_update
-        seen = self._estimator
-        if stored is not None and seen.seen_on != stored.revision:
-            self._wants_update = self._vote.unseen()
-            return self._wants_update != before
-        sigma_m = seen.sigma_m if seen.tracked else None
-        self._wants_update = self._vote.look(
-            stored.revision if stored else b"",
-            Sight(seen.tracked, seen.covered, sigma_m, seen.novelty_deg),
-            now_s,
-        )
-        return self._wants_update != before
-
-    def _tell_state(self) -> None:
-        stored = self._maps.current
-        state = MapState(
-            stored.told_revision if stored else b"",
-            stored.n_landmarks if stored else 0,
-            self._estimator.is_localized(self._clock.now_ns()),
-            min(self._estimator.tracked, MAX_TRACKED),
-            self._wants_update,
-            self._group.team,
-            self._group.epoch,
-            world=stored.world if stored and stored.told_revision else b"",
-            signature=self._group.signature_to_tell(self._now_s()),
-        )
-        self._group.set_own_state(state)
-        self._send(state, 0)
-
-    def _state_interval_s(self) -> float:
-        """How long after the last state the next one is told."""
-        told = self._group.state_of(self._system_id)
-        localized = self._estimator.is_localized(self._clock.now_ns())
-        if told is None or told.localized != localized:
-            return _STATE_INTERVAL_S
-        change = abs(self._estimator.tracked - told.tracked)
-        is_news = change > _NEWS_SHARE * max(told.tracked, 1)
-        return _STATE_INTERVAL_S if is_news else _STATE_AT_REST_S
-
     def _poll_transfers(self) -> None:
         outgoing, events = self._transfers.poll(self._now_s())
         for payload in outgoing:
@@ -522,7 +466,7 @@ class Exchange:
             if joined:
                 self._forgot(event.peer)
                 self.clocks.joined(event.peer)
-                self._has_joined = True
+                self._own_state.joined()
             else:
                 self._passed.forgot(event.peer)
                 self.inter.lost(event.peer)

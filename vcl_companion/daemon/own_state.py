@@ -1,0 +1,120 @@
+"""What this drone tells all others of itself, and when: map, sight of it, vote, team, epoch."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+from vcl_companion.clock import Clock
+from vcl_companion.daemon.estimator import Estimator
+from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.swarm.group import Group
+from vcl_companion.swarm.updates import OwnVote, Sight, UpdateOptions
+from vcl_companion.wire.messages import MAX_TRACKED, MapState
+
+_INTERVAL_S = 1.0
+# Nothing new to tell: that we are there the heartbeats say.
+_AT_REST_S = 2.0
+# So much more or less of the map in sight is news.
+_NEWS_SHARE = 0.1
+# Who joins is told soon, and all who join meanwhile with it: a group starts at one time.
+_TO_NEW_S = 0.2
+
+
+class OwnState:
+    """Tells our state when there is news of it, and now and then.
+
+    Args:
+        system_id: this drone.
+        group: whom it is told, and what of it is theirs.
+        maps: what we fly on.
+        estimator: where we are, and what we see of the map.
+        clock: time base of frames.
+        log: told of teams.
+        options: when the map is to be updated.
+        send: sends a message to a peer, or to all (0).
+    """
+
+    def __init__(
+        self,
+        system_id: int,
+        group: Group,
+        maps: MapStore,
+        estimator: Estimator,
+        clock: Clock,
+        log: FlightLog,
+        options: UpdateOptions,
+        send: Callable[[MapState, int], None],
+    ) -> None:
+        self._system_id = system_id
+        self._group = group
+        self._maps = maps
+        self._estimator = estimator
+        self._clock = clock
+        self._log = log
+        self._send = send
+        self._vote = OwnVote(options)
+        self._wants_update = False
+        self._has_joined = False  # somebody, who has not been told our state since
+        self._told_at_s = float("-inf")
+        self._told_lead = (0, 0)
+
+    def joined(self) -> None:
+        """Note that somebody came who does not know our state."""
+        self._has_joined = True
+
+    def poll(self, now_s: float) -> None:
+        """Look at what we see, and tell our state if it is time."""
+        interval_s = _TO_NEW_S if self._has_joined else self._interval_s()
+        lead = self._group.team, self._group.own_epoch
+        if lead[0] != self._told_lead[0]:
+            self._log.event("team", f"of drone {lead[0]}" if lead[0] else "of all")
+        is_due = now_s - self._told_at_s >= interval_s
+        if self._voted(now_s) or lead != self._told_lead or is_due:
+            self._told_at_s, self._told_lead = now_s, lead
+            self._has_joined = False
+            self.tell()
+
+    def tell(self) -> None:
+        """Tell our state at once."""
+        stored = self._maps.current
+        state = MapState(
+            stored.told_revision if stored else b"",
+            stored.n_landmarks if stored else 0,
+            self._estimator.is_localized(self._clock.now_ns()),
+            min(self._estimator.tracked, MAX_TRACKED),
+            self._wants_update,
+            self._group.team,
+            self._group.epoch,
+            world=stored.world if stored and stored.told_revision else b"",
+            signature=self._group.signature_to_tell(asyncio.get_running_loop().time()),
+        )
+        self._group.set_own_state(state)
+        self._send(state, 0)
+
+    def _voted(self, now_s: float) -> bool:
+        """Look at what we see of the map; whether our vote for an update has changed."""
+        stored = self._maps.current
+        before = self._wants_update
+        seen = self._estimator
+        if stored is not None and seen.seen_on != stored.revision:
+            self._wants_update = self._vote.unseen()
+            return self._wants_update != before
+        sigma_m = seen.sigma_m if seen.tracked else None
+        self._wants_update = self._vote.look(
+            stored.revision if stored else b"",
+            Sight(seen.tracked, seen.covered, sigma_m, seen.novelty_deg),
+            now_s,
+        )
+        return self._wants_update != before
+
+    def _interval_s(self) -> float:
+        """How long after the last state the next one is told."""
+        told = self._group.state_of(self._system_id)
+        localized = self._estimator.is_localized(self._clock.now_ns())
+        if told is None or told.localized != localized:
+            return _INTERVAL_S
+        change = abs(self._estimator.tracked - told.tracked)
+        is_news = change > _NEWS_SHARE * max(told.tracked, 1)
+        return _INTERVAL_S if is_news else _AT_REST_S
