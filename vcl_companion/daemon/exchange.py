@@ -168,6 +168,7 @@ class Exchange:
             self._send,
             self.decide,
             self._passed,
+            transfers.frames_carried_in_s,
             lambda: transfers.is_receiving(BlobKind.MAP, self._now_s()),
             log,
             clock,

@@ -68,6 +68,7 @@ class MapRounds:
         ask: sends a request to a peer.
         decide: takes what became of a round.
         passed: sends the frames of an update on while it is built.
+        carried_in_s: how long so many frames take on the link.
         is_receiving_map: whether a peer's map has been coming in lately.
         log: told of every update that is begun.
         clock: time base of frames.
@@ -86,6 +87,7 @@ class MapRounds:
         ask: Callable[[FrameRequest, int], None],
         decide: Decide,
         passed: PassedFrames,
+        carried_in_s: Callable[[int], float],
         is_receiving_map: Callable[[], bool],
         log: FlightLog,
         clock: Clock,
@@ -101,6 +103,7 @@ class MapRounds:
         self._decide = decide
         self._passed = passed
         self._is_updating = False
+        self._carried_in_s = carried_in_s
         self._is_receiving_map = is_receiving_map
         self._log = log
         self._clock = clock
@@ -193,12 +196,13 @@ class MapRounds:
         contributors = self._group.contributors(
             (*lost, *self._group.wanting_update), update.contributors
         )
+        n_earlier = len(lost) * (update.joiner_frames - 1)
         wanted = Wanted(
             frame.captured_at_ns,
             contributors,
             dict.fromkeys(lost, update.joiner_frames - 1),
             update.joiner_spacing_s,
-            update.gather_timeout_s,
+            update.gather_timeout_s + self._carried_in_s(len(contributors) - 1 + n_earlier),
         )
         self._passed.over()
         self._is_updating = True
@@ -276,6 +280,10 @@ class MapRounds:
         described = ours.result()
         if isinstance(described, NoMap):
             return described
+        if self._is_updating:
+            # Not before the others' have come: on a radio they would come too late beside it.
+            for answer in described:
+                self._passed.pass_on(answer)
         gathered = described + theirs.result()
         _log.info("%d frames gathered in %.1f s", len(gathered), self._now_s() - began_s)
         return gathered
@@ -287,13 +295,9 @@ class MapRounds:
             if earlier is not None:
                 own.append(earlier)
         try:
-            described = [await self._describe(f, self._gathering.request_id) for f in own]
+            return [await self._describe(f, self._gathering.request_id) for f in own]
         except ValueError as error:
             return NoMap(f"our own frame: {error}")
-        if self._is_updating:
-            for answer in described:
-                self._passed.pass_on(answer)
-        return described
 
     async def _built(
         self,

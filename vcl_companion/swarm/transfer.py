@@ -25,6 +25,9 @@ from vcl_companion.wire.chunks import Chunk, Descriptor, Reply, TransferStatus, 
 from vcl_companion.wire.header import BlobKind
 from vcl_companion.wire.tunnel import PayloadType, TunnelPayload, encode_payload
 
+# Of WebP at the usual quality, 640 x 480.
+_USUAL_IMAGE_BYTES = 40_000
+
 __all__ = [
     "BlobDelivered",
     "BlobHeld",
@@ -90,6 +93,10 @@ class Transfers:
     def carried_in_s(self, n_bytes: int) -> float:
         """Return how long a blob takes to a peer if nothing else is said meanwhile."""
         return self._options.pace.carried_in_s(n_bytes)
+
+    def frames_carried_in_s(self, n_frames: int) -> float:
+        """Return how long frames for a map take, one after the other."""
+        return self.carried_in_s(n_frames * min(self.image_bytes, _USUAL_IMAGE_BYTES))
 
     @property
     def incoming_memory_bytes(self) -> int:

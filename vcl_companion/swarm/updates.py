@@ -61,7 +61,8 @@ class UpdateOptions:
         hold_s: how long the majority has to want it.
         interval_s: shortest time from the end of one round, or from a new revision,
             to the next round; up to eight times as long while rounds do not help.
-        gather_timeout_s: how long a round waits for the members' frames.
+        gather_timeout_s: how long a round waits for the members' frames, beyond what these
+            take on the link.
         delivery_wait_s: how long a revision may take to reach everybody alive
             before the next round, and how long a peer that claims a map may take
             to deliver it before a first one is made without it.
