@@ -29,7 +29,7 @@ class Pace:
         status_interval_s: how long a sender waits for an answer before it asks
             again (longer every time it gets none); a receiver answers within it.
         give_up_s: a sender without progress for this long fails.
-        image_bytes: of a keyframe's image, at most: its quality is lowered for it. Of 10 kB
+        image_bytes: of a keyframe's image, at most: its quality is lowered for it. Of 9 kB
             maps are a centimetre or two worse (docs/network.md).
         quick_s: who comes to a swarm with a map waits for no more of it at first than takes so
             long to send (``daemon/map_parts.py``).
@@ -55,9 +55,9 @@ class Pace:
 # A radio of 57,600 baud takes 5,760 bytes/s from us, and the air is everybody's; so 70 %.
 PROFILES: Mapping[Profile, Pace] = MappingProxyType(
     {
-        "wifi": Pace(400_000.0, 8192, 0.2, 30.0, 1_000_000, 1.0),
-        "radio-57k": Pace(4_000.0, 2 * MAX_FRAME_BYTES, 1.0, 60.0, 9_500, 15.0),
-        "radio-115k": Pace(8_000.0, 2 * MAX_FRAME_BYTES, 0.6, 45.0, 16_000, 10.0),
+        "wifi": Pace(400_000.0, 8192, 0.2, 30.0, 1_000_000, 0.7),
+        "radio-57k": Pace(4_000.0, 2 * MAX_FRAME_BYTES, 1.0, 60.0, 9_000, 10.0),
+        "radio-115k": Pace(8_000.0, 2 * MAX_FRAME_BYTES, 0.6, 45.0, 16_000, 8.0),
     }
 )
 
