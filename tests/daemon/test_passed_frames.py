@@ -94,7 +94,7 @@ def test_what_all_have_heard_is_not_passed_on_and_held_by_who_says_so() -> None:
 
 def test_what_a_member_gives_to_the_coordinator_is_held_where_it_is_heard() -> None:
     three = Member(3)
-    three.frames.overheard(frame_of(2, b"of two"))
+    three.frames.hold(frame_of(2, b"of two"))
     assert three.frames.held[name_of_image(b"of two")] == b"of two"
 
 
@@ -117,7 +117,7 @@ def test_only_the_coordinator_s_frames_are_held_and_only_so_many() -> None:
         three.frames.take(1, encode_frame(frame_of(2, b"of two")))
     three.frames.take(1, blob)
     assert three.frames.held[name_of_image(b"of two")] == b"of two"
-    three.frames.given(frame_of(3, b"my own"))
+    three.frames.hold(frame_of(3, b"my own"))
     for n in range(100):
         three.frames.take(1, encode_frame(frame_of(2, b"%d" % n), BlobKind.PASSED_FRAME))
     assert len(three.frames.held) == 48

@@ -447,17 +447,20 @@ class Companion:
         n_inliers: int = 0,
     ) -> NotLocalized | None:
         """Send the pose of a frame, at its own time; or say why it cannot be."""
-        sent = self._autopilot.send_pose(
-            self._estimator.local_from_world @ state.world_from_body,
-            state.pose_covariance(),
-            frame.captured_at_ns,
-            self._estimator.n_resets,
-        )
-        if not sent:
+        if not self._tell(state, frame.captured_at_ns):
             return NotLocalized("the pose's covariance is not finite", n_matched, n_inliers)
         self._sent_at_ns = max(self._sent_at_ns, frame.captured_at_ns)
         self._outcomes.sent(frame, source, by, n_matched, n_inliers)
         return None
+
+    def _tell(self, state: FilterState, at_ns: int) -> bool:
+        """Send the autopilot a state's pose in the frame that it knows; whether that can be."""
+        return self._autopilot.send_pose(
+            self._estimator.local_from_world @ state.world_from_body,
+            state.pose_covariance(),
+            at_ns,
+            self._estimator.n_resets,
+        )
 
     def _give_up(self, frame: Frame, why: NotLocalized) -> None:
         """Refuse a frame; while the last fix is fresh, attitude and motion still say where it is.
@@ -468,12 +471,7 @@ class Companion:
         self._health.refused(why.reason)
         at_ns = frame.captured_at_ns
         state = self._estimator.coasted_at(at_ns) if at_ns > self._sent_at_ns else None
-        coasted = state is not None and self._autopilot.send_pose(
-            self._estimator.local_from_world @ state.world_from_body,
-            state.pose_covariance(),
-            at_ns,
-            self._estimator.n_resets,
-        )
+        coasted = state is not None and self._tell(state, at_ns)
         if coasted:
             self._sent_at_ns = at_ns
         self._outcomes.refuse(frame, why, coasted=coasted)

@@ -157,7 +157,7 @@ class Exchange:
             work,
             self._hand_answer,
             transfers.cancel,
-            self._passed.given,
+            self._passed.hold,
             transfers.image_bytes,
         )
         self._rounds = MapRounds(
@@ -177,9 +177,7 @@ class Exchange:
             RoundOptions(options.map, options.update),
             rng,
         )
-        self._own_state = OwnState(
-            system_id, group, maps, estimator, clock, log, options.update, self._send
-        )
+        self._own_state = OwnState(group, maps, estimator, clock, log, options.update, self._send)
         self._sharing = MapSharing(
             group,
             transfers,
@@ -396,7 +394,7 @@ class Exchange:
             self._malformed(peer, "frame", error)
             return
         if frame.drone_id == peer and not self._group.is_coordinator:
-            self._passed.overheard(frame)
+            self._passed.hold(frame)
             return
         refusal = self._rounds.take(peer, frame)
         if refusal is not None:
@@ -442,13 +440,13 @@ class Exchange:
     def _hand_answer(self, peer: int, blob: bytes) -> tuple[int, ...]:
         """Send a frame to who has asked for it, and to all others where that costs nothing."""
         hears = self._group.trusted_teammates if self._transfers.shares_network else ()
-        others = [m for m in hears if m not in (peer, self._system_id) and self._has_map(m)]
+        is_first = self._maps.current is None  # all are about to have one
+        others = [
+            m
+            for m in hears
+            if m not in (peer, self._system_id) and (is_first or self._group.has_map(m))
+        ]
         return tuple(self._hand(BlobKind.FRAME_ANSWER, to, blob) for to in (peer, *others))
-
-    def _has_map(self, peer: int) -> bool:
-        """Whether a peer has a map, or all are about to have a first one."""
-        state = self._group.state_of(peer)
-        return self._maps.current is None or (state is not None and bool(state.revision))
 
     def _send(self, message: Message, peer: int) -> None:
         """Have a message to a peer, or to all (0), go before all that is less urgent."""

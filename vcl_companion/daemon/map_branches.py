@@ -42,7 +42,7 @@ class MapBranches:
         self._wait_s = wait_s
         self._given_by = group.own_id
         self._refused: deque[bytes] = deque(maxlen=_MAX_REFUSED)
-        self._merged: dict[int, bytes] = {}  # of another team's coordinator, into ours
+        self._merged: set[int] = set()  # other teams' coordinators, whose map is in ours
         self._foreign_since_s: dict[int, tuple[bytes, float]] = {}
 
     def given_by(self, peer: int) -> None:
@@ -53,9 +53,9 @@ class MapBranches:
         """Note a map that cannot be merged with ours."""
         self._refused.append(revision)
 
-    def merged(self, peer: int, revision: bytes) -> None:
+    def merged(self, peer: int) -> None:
         """Note that a peer's map has been merged into ours."""
-        self._merged[peer] = revision
+        self._merged.add(peer)
 
     def is_awaited(self, peer: int, now_s: float) -> bool:
         """Whether a teammate is not to be handed ours yet: it has one that we could merge."""
@@ -96,9 +96,7 @@ class MapBranches:
         if current is None:
             return ()
         teammates = group.teammates
-        gone = [peer for peer in self._merged if peer in teammates or peer not in group.alive]
-        for peer in gone:
-            del self._merged[peer]
+        self._merged = self._merged.intersection(group.alive).difference(teammates)
         return tuple(sorted(self._merged)) if group.is_coordinator else ()
 
     def is_to_merge(self, peer: int, offer: MapOffer) -> bool:
@@ -151,5 +149,5 @@ def way_into(current: StoredMap, new: LandmarkMap, revision: bytes) -> JoinedMap
     world = current.world
     if new.world_of(revision) == world:
         return None
-    ways = [joined for joined in new.joined if joined.world == world]
-    return ways[-1] if ways else "it is of another world, which ours was not joined with"
+    reason = "it is of another world, which ours was not joined with"
+    return new.joined_with(world) or reason

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 from vcl_companion.daemon.map_branches import MapBranches
 from vcl_companion.daemon.map_offer import HandOut
-from vcl_companion.daemon.map_parts import MapParts
+from vcl_companion.daemon.map_parts import TAKE_IN_S, MapParts
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
@@ -24,8 +24,6 @@ from vcl_companion.wire.map_update import images_in_update, without_images
 
 # A transfer that has failed begins anew after this.
 _HAND_AGAIN_S = 10.0
-# A peer, however busy, has taken a map in and said so after this, or refused it.
-_TAKE_IN_S = 20.0
 # What was delivered in vain is not likely to be of use the next time: ever more rarely.
 _HAND_AGAIN_AT_MOST_S = 120.0
 # A coordinator that we see on the map before ours has made ours: it is about to follow.
@@ -113,7 +111,7 @@ class MapHanding:
         self._parts.delivered(peer, transfer_id, now_s)
         handed = self._handed.get(peer)
         if handed is not None and handed.transfer_id == transfer_id:
-            wait_s = min(_TAKE_IN_S * 2.0**handed.n_delivered, _HAND_AGAIN_AT_MOST_S)
+            wait_s = min(TAKE_IN_S * 2.0**handed.n_delivered, _HAND_AGAIN_AT_MOST_S)
             self._handed[peer] = replace(
                 handed, n_delivered=handed.n_delivered + 1, again_at_s=now_s + wait_s
             )
@@ -134,7 +132,7 @@ class MapHanding:
                 continue
             if self._group.state_of(peer) is None and self._parts.is_long(stored):
                 continue  # it is about to say what it has
-            if not self._has_a_map(peer) and self._parts.comes_first(peer, stored):
+            if not self._group.has_map(peer) and self._parts.comes_first(peer, stored):
                 continue
             self._hand(peer, stored, now_s, self._form_for)
         merges = self._branches.receiver(now_s)
@@ -165,7 +163,7 @@ class MapHanding:
 
         None while an image of the map is still on its way there, or it is still being made.
         """
-        if n_delivered == 0 and not self._has_a_map(peer):
+        if n_delivered == 0 and not self._group.has_map(peer):
             state = self._group.state_of(peer)
             is_on_part = state is not None and state.n_landmarks > 0
             rest = self._parts.rest_for(peer, stored, self._now_s(), is_on_part=is_on_part)
@@ -186,11 +184,6 @@ class MapHanding:
         if held not in without:
             without[held] = without_images(stored.update, held)
         return BlobKind.MAP_UPDATE, without[held]
-
-    def _has_a_map(self, peer: int) -> bool:
-        """Whether a peer has said so; one on a part of a map says that it has none."""
-        state = self._group.state_of(peer)
-        return state is not None and bool(state.revision)
 
     def _lacking(self, revision: bytes) -> list[int]:
         group = self._group

@@ -134,21 +134,23 @@ def ready_map(
     if current is not None and current.revision == offer.parent and not update:
         update = encode_map_update(data, current.index.landmark_map)
     templates = prepare_templates(index.landmark_map, index.uncertainty) if tracked else None
-    contradicts = "" if current is None else _contradiction(current, index.landmark_map, data)
+    contradicts = (
+        "" if current is None else _contradiction(current, index.landmark_map, offer.revision)
+    )
     return ReadyMap(data, index, update, templates, contradicts, offer.part_of)
 
 
-def _contradiction(current: StoredMap, landmark_map: LandmarkMap, data: bytes) -> str:
+def _contradiction(current: StoredMap, landmark_map: LandmarkMap, revision: bytes) -> str:
     """Say how a map contradicts the one in use; empty if it does not.
 
     One of another world that ours was joined with is compared in ours. Where it was not, and
     they have keyframes in common all the same, they are of one world by different names.
     """
     own = current.index.landmark_map
-    if landmark_map.world_of(revision_of(data)) != current.world:
-        ways = [joined for joined in landmark_map.joined if joined.world == current.world]
-        if ways:
-            landmark_map = moved_to(landmark_map, ways[-1].world_from_other.inverse())
+    if landmark_map.world_of(revision) != current.world:
+        joined = landmark_map.joined_with(current.world)
+        if joined is not None:
+            landmark_map = moved_to(landmark_map, joined.world_from_other.inverse())
     if landmark_map.parent == current.revision and not have_common_keyframes(own, landmark_map):
         return "made from ours, it has none of its keyframes"
     return contradiction(own, current.index.uncertainty, landmark_map)

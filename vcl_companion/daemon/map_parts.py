@@ -20,8 +20,8 @@ _log = logging.getLogger(__name__)
 
 # Rests are of one revision at a time, and everybody who comes has one of the last parts.
 _N_RESTS = 8
-# Who does not fly on a part by then cannot use it.
-_TAKE_IN_S = 20.0
+# A peer, however busy, has taken in what it was sent and said so after this, or refused it.
+TAKE_IN_S = 20.0
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class MapParts:
             return b""
         if not is_on_part:
             since_s = now_s if sent.arrived_at_s is None else sent.arrived_at_s
-            return None if now_s < since_s + _TAKE_IN_S else b""
+            return None if now_s < since_s + TAKE_IN_S else b""
         rest = self._rests.get((stored.revision, sent.blob))
         if rest is None:
             self._want(sent.blob)

@@ -196,13 +196,14 @@ class MapRounds:
         contributors = self._group.contributors(
             (*lost, *self._group.wanting_update), update.contributors
         )
-        n_earlier = len(lost) * (update.joiner_frames - 1)
+        earlier = dict.fromkeys(lost, update.joiner_frames - 1)
+        n_frames = len(contributors) - 1 + sum(earlier.values())
         wanted = Wanted(
             frame.captured_at_ns,
             contributors,
-            dict.fromkeys(lost, update.joiner_frames - 1),
+            earlier,
             update.joiner_spacing_s,
-            update.gather_timeout_s + self._carried_in_s(len(contributors) - 1 + n_earlier),
+            update.gather_timeout_s + self._carried_in_s(n_frames),
         )
         self._passed.over()
         self._is_updating = True
@@ -274,9 +275,9 @@ class MapRounds:
     ) -> list[FrameAnswer] | NoMap:
         """Return our own frames and those of the others, or why ours cannot be used."""
         began_s = self._now_s()
-        async with asyncio.TaskGroup() as group:  # ours are encoded while the others' come
-            ours = group.create_task(self._own(newest, wanted))
-            theirs = group.create_task(self._gathering.gather(wanted, is_over))
+        async with asyncio.TaskGroup() as both:  # ours are encoded while the others' come
+            ours = both.create_task(self._own(newest, wanted))
+            theirs = both.create_task(self._gathering.gather(wanted, is_over))
         described = ours.result()
         if isinstance(described, NoMap):
             return described

@@ -29,7 +29,6 @@ from vcl_companion.mapping.options import NoMap
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.quarantine import Evidence
 from vcl_companion.swarm.transfer import BlobKind, Transfers
-from vcl_companion.wire.map_codec import revision_of
 from vcl_companion.wire.map_update import images_missing_in
 
 _log = logging.getLogger(__name__)
@@ -146,7 +145,7 @@ class MapSharing:
             return why_not, ""
         if self._contradicts(peer, offer, ready):
             return "map that contradicts ours", ready.contradicts
-        way = self._way_into(peer, ready)
+        way = self._way_into(peer, ready, offer.revision)
         if isinstance(way, str):
             return "map that is not joined with ours", way
         self.handing.was_given(peer, offer.revision)
@@ -172,7 +171,7 @@ class MapSharing:
                 break
             now = self._maps.current
             if now is not None and now.parent == current.revision and now.has_in_it(offer.revision):
-                self._branches.merged(peer, offer.revision)
+                self._branches.merged(peer)
                 self._log.event("merged", f"map {offer.revision.hex()} of drone {peer}")
                 _log.info("the map of drone %d is merged into ours", peer)
                 return True
@@ -192,7 +191,7 @@ class MapSharing:
             _log.exception("a map cannot be merged")
             return NoMap(f"merging failed: {type(error).__name__}")
 
-    def _way_into(self, peer: int, ready: ReadyMap) -> JoinedMap | str | None:
+    def _way_into(self, peer: int, ready: ReadyMap, revision: bytes) -> JoinedMap | str | None:
         """Say how we get onto a map; see ``way_into``. A senior team's must have ours in it.
 
         Who is lost on its own map, or flies on one that most others say is wrong, has no way
@@ -207,7 +206,7 @@ class MapSharing:
             for other in new.joined
         ):
             return "ours is not in it"
-        way = way_into(current, new, revision_of(ready.data))
+        way = way_into(current, new, revision)
         own = self._group.state_of(self._group.own_id)
         is_of_no_use = own is None or not own.localized or bool(ready.contradicts)
         return None if isinstance(way, str) and is_of_no_use else way

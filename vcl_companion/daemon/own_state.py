@@ -26,7 +26,6 @@ class OwnState:
     """Tells our state when there is news of it, and now and then.
 
     Args:
-        system_id: this drone.
         group: whom it is told, and what of it is theirs.
         maps: what we fly on.
         estimator: where we are, and what we see of the map.
@@ -38,7 +37,6 @@ class OwnState:
 
     def __init__(
         self,
-        system_id: int,
         group: Group,
         maps: MapStore,
         estimator: Estimator,
@@ -47,7 +45,6 @@ class OwnState:
         options: UpdateOptions,
         send: Callable[[MapState, int], None],
     ) -> None:
-        self._system_id = system_id
         self._group = group
         self._maps = maps
         self._estimator = estimator
@@ -111,7 +108,7 @@ class OwnState:
 
     def _interval_s(self) -> float:
         """How long after the last state the next one is told."""
-        told = self._group.state_of(self._system_id)
+        told = self._group.state_of(self._group.own_id)
         localized = self._estimator.is_localized(self._clock.now_ns())
         if told is None or told.localized != localized:
             return _INTERVAL_S

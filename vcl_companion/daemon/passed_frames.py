@@ -72,8 +72,8 @@ class PassedFrames:
         """Images that are here, by their names."""
         return self._held
 
-    def given(self, frame: FrameAnswer) -> None:
-        """Hold the image of a frame of our own, as it was given to a peer."""
+    def hold(self, frame: FrameAnswer) -> None:
+        """Hold the image of a frame that was given to a peer: by us, or by a member we heard."""
         self._keep(frame.image_bytes)
         self._look_at(frame)
 
@@ -92,14 +92,7 @@ class PassedFrames:
         """
         if peer != self._group.coordinator:
             raise WireError("a frame passed on, but not by the coordinator")
-        frame = decode_frame(blob, BlobKind.PASSED_FRAME)
-        self._keep(frame.image_bytes)
-        self._look_at(frame)
-
-    def overheard(self, frame: FrameAnswer) -> None:
-        """Hold the image of a frame that a member has given to the coordinator."""
-        self._keep(frame.image_bytes)
-        self._look_at(frame)
+        self.hold(decode_frame(blob, BlobKind.PASSED_FRAME))
 
     def answered(self, frame: FrameAnswer, digest: bytes) -> None:
         """Note what a member has given to us, and perhaps to others, in a blob."""

@@ -136,6 +136,10 @@ class LandmarkMap:
                 f"LandmarkMap: {len(self.joined)} maps cannot have been merged into it"
             )
 
+    def joined_with(self, world: bytes) -> JoinedMap | None:
+        """Return the last map of another world that was merged into this one; None for none."""
+        return next((j for j in reversed(self.joined) if j.world == world), None)
+
     def world_of(self, revision: bytes) -> bytes:
         """Return the name of the world that the map is in, given its own revision."""
         return self.world or revision

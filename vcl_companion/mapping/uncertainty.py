@@ -52,8 +52,7 @@ class MapUncertainty:
 
     def marginal(self) -> Array:
         """Return (N, 3, 3) the whole covariance of each landmark, m^2."""
-        shared = self.landmark_lever @ self.keyframe_covariance
-        return self.landmark_covariance + shared @ np.swapaxes(self.landmark_lever, 1, 2)
+        return self._with_shared(slice(None), 1.0)
 
     def for_matching(self, landmarks: NDArray[np.intp]) -> Array:
         """Return (M, 3, 3) covariances that tell sightings of some landmarks from wrong ones.
@@ -61,9 +60,12 @@ class MapUncertainty:
         The error that they share is taken for more than it is: where a wide step ends a map, all
         new views hang on the few landmarks that such a gate lets in.
         """
+        return self._with_shared(landmarks, _WIDER)
+
+    def _with_shared(self, landmarks: NDArray[np.intp] | slice, factor: float) -> Array:
         lever = self.landmark_lever[landmarks]
-        shared = _WIDER**2 * lever @ self.keyframe_covariance
-        return self.landmark_covariance[landmarks] + shared @ np.swapaxes(lever, 1, 2)
+        shared = factor**2 * lever @ self.keyframe_covariance
+        return np.asarray(self.landmark_covariance[landmarks] + shared @ np.swapaxes(lever, 1, 2))
 
 
 def views_of(landmark_map: LandmarkMap) -> Views:

@@ -272,6 +272,11 @@ class Group:
         order = dict.fromkeys((self.own_id, *first, *others))
         return tuple(m for m in order if m in trusted)[:most]
 
+    def has_map(self, member: int) -> bool:
+        """Whether a member has said so; one on a part of a map says that it has none."""
+        state = self._states.get(member)
+        return state is not None and bool(state.revision)
+
     def holders(self, revision: bytes) -> tuple[int, ...]:
         """Return the teammates that hold this revision."""
         return tuple(

@@ -6,6 +6,7 @@ on every machine. The work is done in ``landmark_kernels``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -86,6 +87,17 @@ class Stream:
     def writing(cls, n_bytes: int) -> Stream:
         """Return one that writes into so much space."""
         return cls(np.zeros(n_bytes, dtype=np.uint8), reads=False)
+
+    @classmethod
+    def written_by(cls, write: Callable[[Stream], None], n_bytes: int) -> bytes:
+        """Return what is written to one, in more space where so much is too little."""
+        while True:
+            stream = cls.writing(n_bytes)
+            write(stream)
+            data = stream.written()
+            if not stream.failed:
+                return data
+            n_bytes *= 2
 
     @property
     def failed(self) -> bool:

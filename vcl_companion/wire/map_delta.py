@@ -66,16 +66,14 @@ def encode_changes(child: LandmarkMap, parent: LandmarkMap, known: Known) -> byt
     )
     fresh = np.setdiff1d(np.arange(len(pixels)), now)
     new, counts = rows_of_new(child.points_world[fresh], pixels[fresh], views)
-    n_bytes = room_of(pixels) + len(listed)
-    while True:
-        stream = Stream.writing(n_bytes)
+
+    def write(stream: Stream) -> None:
         stream.code_listed(listed)
         stream.code_known(changed, (before[:, :, 0] >= 0).astype(np.int64))
         code_new(stream, new, counts, views)
-        data = stream.written()
-        if not stream.failed:
-            return _COUNT.pack(len(listed)) + data
-        n_bytes *= 2
+
+    data = Stream.written_by(write, room_of(pixels) + len(listed))
+    return _COUNT.pack(len(listed)) + data
 
 
 def take_changes(reader: Reader, head: MapHead, parent: LandmarkMap, known: Known) -> LandmarkMap:

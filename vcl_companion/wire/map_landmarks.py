@@ -36,14 +36,7 @@ def encode_landmarks(points: Array, pixels: Integers, views: Views) -> bytes:
         ValueError: an observation lies outside of its image.
     """
     rows, counts = rows_of_new(points, pixels, views)
-    n_bytes = room_of(pixels)
-    while True:
-        stream = Stream.writing(n_bytes)
-        code_new(stream, rows, counts, views)
-        data = stream.written()
-        if not stream.failed:
-            return data
-        n_bytes *= 2
+    return Stream.written_by(lambda stream: code_new(stream, rows, counts, views), room_of(pixels))
 
 
 def decode_landmarks(data: bytes, n: int, views: Views) -> tuple[Array, Integers]:
