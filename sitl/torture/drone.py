@@ -23,7 +23,7 @@ from vcl_companion.daemon.exchange import Exchange
 from vcl_companion.daemon.inter_target import Asked
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.links.mavlink import Tunnel
+from vcl_companion.links.messages import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions, open_signing
 from vcl_companion.localization.intra import Localized
 from vcl_companion.localization.pose_filter import FilterState

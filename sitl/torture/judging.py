@@ -12,7 +12,7 @@ from collections.abc import Callable
 from sitl.torture.dice import Dice
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.errors import WireError
-from vcl_companion.links.mavlink import Tunnel
+from vcl_companion.links.messages import Tunnel
 from vcl_companion.mapping.drone_view import decode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.swarm.transfer import BlobKind

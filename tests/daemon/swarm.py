@@ -33,7 +33,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.counters import LinkCounters
 from vcl_companion.links.key_file import make_key_file
-from vcl_companion.links.mavlink import Tunnel
+from vcl_companion.links.messages import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions, open_signing
 from vcl_companion.localization.intra import LocalizationOptions, Localized
 from vcl_companion.localization.pipeline import PipelineOptions

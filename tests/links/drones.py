@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from tests.ports import free_ports
 from vcl_companion.clock import Clock, ManualClock, Moment, system_moment
-from vcl_companion.links.mavlink import Tunnel
+from vcl_companion.links.messages import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions, open_signing
 
 MEMBERS = frozenset({1, 2, 3})

@@ -5,7 +5,7 @@ import pytest
 
 from vcl_companion.geometry.rotation import Array, exp_so3, log_so3
 from vcl_companion.links.attitude import AttitudeHistory
-from vcl_companion.links.mavlink import AttitudeSample
+from vcl_companion.links.messages import AttitudeSample
 
 MS = 1_000_000
 OFFSET_NS = 5_000 * MS

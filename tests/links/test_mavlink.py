@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from tests.links import wire
 from vcl_companion.geometry.rotation import matrix_from_euler, matrix_from_quaternion
 from vcl_companion.links.counters import LinkTally
-from vcl_companion.links.mavlink import (
+from vcl_companion.links.mavlink import Codec
+from vcl_companion.links.messages import (
     AttitudeSample,
-    Codec,
     CommandAck,
     CommandLong,
     Heartbeat,

@@ -12,7 +12,7 @@ from tests.ports import free_ports
 from vcl_companion.clock import ManualClock, SystemClock
 from vcl_companion.errors import ConfigError
 from vcl_companion.links.key_file import make_key_file
-from vcl_companion.links.mavlink import Tunnel
+from vcl_companion.links.messages import Tunnel
 from vcl_companion.links.peers import PeerOptions
 from vcl_companion.swarm.peer_time import PeerTime
 

@@ -17,7 +17,7 @@ from tests.links.running import Udp, running, udp
 from tests.links.signed import NOON, NOON_S, Clocks
 from tests.ports import free_ports
 from vcl_companion.errors import ConfigError
-from vcl_companion.links.mavlink import Tunnel
+from vcl_companion.links.messages import Tunnel
 from vcl_companion.links.peers import PeerOptions
 
 PAYLOAD_TYPE = 40000

@@ -11,7 +11,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from tests.links import signed, wire
 from tests.links.signed import NOON, SECRET, Clocks
 from vcl_companion.links.counters import LinkTally
-from vcl_companion.links.mavlink import Codec, Heartbeat, Timesync, Tunnel, Untimely
+from vcl_companion.links.mavlink import Codec
+from vcl_companion.links.messages import Heartbeat, Timesync, Tunnel, Untimely
 from vcl_companion.links.signing import Signing, SigningKey
 
 S = 100_000  # ticks

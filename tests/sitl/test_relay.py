@@ -15,7 +15,7 @@ from sitl.partitions import parse_partition
 from sitl.relay import Relay
 from tests.ports import free_ports
 from vcl_companion.clock import ManualClock
-from vcl_companion.links.mavlink import Tunnel
+from vcl_companion.links.messages import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions, open_signing
 from vcl_companion.wire.messages import MapState
 from vcl_companion.wire.tunnel import encode_payload

@@ -36,7 +36,7 @@ from vcl_companion.daemon.peer_trust import PeerTrust
 from vcl_companion.daemon.refusals import Refusals
 from vcl_companion.errors import WireError
 from vcl_companion.links.autopilot import AutopilotLink
-from vcl_companion.links.mavlink import Tunnel
+from vcl_companion.links.messages import Tunnel
 from vcl_companion.links.peers import PeerLink
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from vcl_companion.geometry.rotation import Array, exp_so3, log_so3
-from vcl_companion.links.mavlink import AttitudeSample
+from vcl_companion.links.messages import AttitudeSample
 
 _NS_PER_MS = 1_000_000
 # The stamp is cut off to whole milliseconds: on average the truth is half of one later.

@@ -23,12 +23,9 @@ from vcl_companion.links.mavlink import (
     RESULT_ACCEPTED,
     SET_MESSAGE_INTERVAL,
     STATUS_TEXT_BYTES,
-    AttitudeSample,
     Codec,
-    CommandAck,
-    Message,
-    Timesync,
 )
+from vcl_companion.links.messages import AttitudeSample, CommandAck, Message, Timesync
 from vcl_companion.links.reconnect import Address
 from vcl_companion.links.timesync import TimesyncEstimator
 from vcl_companion.links.transport import check_allowed_senders, open_transport, parse_link

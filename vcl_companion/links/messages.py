@@ -1,0 +1,115 @@
+"""What comes over a MAVLink link, decoded: one value per message that anybody here wants."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from vcl_companion.geometry.rotation import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Message:
+    """A message with its sender."""
+
+    sender_system: int
+    sender_component: int
+
+
+@dataclass(frozen=True)
+class Heartbeat(Message):
+    """Somebody is there: ``vehicle_type`` MAV_TYPE, ``autopilot`` MAV_AUTOPILOT, MAV_STATE."""
+
+    vehicle_type: int
+    autopilot: int
+    base_mode: int
+    custom_mode: int
+    system_status: int
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudeSample(Message):
+    """An attitude by the autopilot's own clock.
+
+    Attributes:
+        time_boot_ms: milliseconds since the autopilot's start, cut off, not rounded.
+        ned_from_body: (3, 3) rotation.
+        source: the message that it came in.
+    """
+
+    time_boot_ms: int
+    ned_from_body: Array
+    source: Literal["quaternion", "euler"]
+
+    def __post_init__(self) -> None:
+        if self.ned_from_body.shape != (3, 3):
+            raise ValueError(f"an attitude is (3, 3), got {self.ned_from_body.shape}")
+        self.ned_from_body.flags.writeable = False
+
+
+@dataclass(frozen=True)
+class Timesync(Message):
+    """A question (``tc1_ns`` 0) or the answer to the one that was asked at ``ts1_ns``.
+
+    ``target_system`` and ``target_component`` 0 are everybody.
+    """
+
+    tc1_ns: int
+    ts1_ns: int
+    target_system: int = 0
+    target_component: int = 0
+
+
+@dataclass(frozen=True)
+class Untimely(Message):
+    """A frame with a right signature and a wrong time: good for telling the time, no more.
+
+    Attributes:
+        timestamp: what it was signed with.
+        ahead: whether that is later than it may be, else earlier.
+        timesync: what it says, if it is a TIMESYNC.
+    """
+
+    timestamp: int
+    ahead: bool
+    timesync: Timesync | None
+
+
+@dataclass(frozen=True)
+class Tunnel(Message):
+    """An opaque payload of at most 128 bytes; ``target_system`` 0 is everybody."""
+
+    target_system: int
+    payload_type: int
+    payload: bytes
+
+
+@dataclass(frozen=True)
+class StatusText(Message):
+    """One chunk of a text; ``text_id`` 0 means it is the only one."""
+
+    severity: int
+    text: str
+    text_id: int
+    chunk: int
+
+
+@dataclass(frozen=True)
+class CommandLong(Message):
+    """A command with its seven parameters."""
+
+    target_system: int
+    target_component: int
+    command: int
+    confirmation: int
+    parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class CommandAck(Message):
+    """What became of a command: ``result`` MAV_RESULT."""
+
+    command: int
+    result: int
+    target_system: int
+    target_component: int
