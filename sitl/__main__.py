@@ -54,6 +54,18 @@ def main() -> None:
 @click.argument("recording", metavar="[RECORDING]", default="demo", type=_FOLDER)
 @click.option("--out", required=True, metavar="DIR", type=_FOLDER, help="Results; made if absent.")
 @click.option(
+    "--autopilot",
+    metavar="ardupilot=FILE",
+    help="A real firmware built for simulation, in the stand-in's place.",
+)
+@click.option(
+    "--parameter",
+    "parameters",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Of the real --autopilot, set before it starts (repeatable).",
+)
+@click.option(
     "--speed",
     default="1",
     show_default=True,
@@ -149,6 +161,8 @@ def main() -> None:
 def fly(
     recording: Path,
     out: Path,
+    autopilot: str | None,
+    parameters: tuple[str, ...],
     speed: float,
     drones: str,
     distances: tuple[str, ...],
@@ -174,7 +188,8 @@ def fly(
 ) -> None:
     """Fly RECORDING (a folder; the embedded demo by default) and report how it went.
 
-    One real daemon and one stand-in autopilot per drone, over real sockets.
+    One real daemon and one stand-in autopilot per drone, over real sockets; with --autopilot
+    the real firmware, in simulation, whose sensors feel the recording's true motion.
     What the drones say to each other may go over a bad radio: --loss to --partition,
     in seconds of the wall clock whatever the --speed, but for --partition.
     Leaves estimates, truth, report.json and report.html in the output folder.
@@ -183,6 +198,7 @@ def fly(
     from rich.console import Console
 
     from sitl.absences import parse_kill, parse_late
+    from sitl.firmware import parse_firmware
     from sitl.fly import fly as fly_recording
     from sitl.network import NetworkOptions
     from sitl.partitions import parse_partition
@@ -215,6 +231,7 @@ def fly(
             partitions=tuple(map(parse_partition, partitions)),
         ),
         absences=(*map(parse_late, late), *map(parse_kill, kills)),
+        firmware=parse_firmware(autopilot, parameters) if autopilot else None,
     )
     embedded = str(recording) == "demo" and not recording.exists()
     console = Console()

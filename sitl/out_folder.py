@@ -6,11 +6,15 @@ import json
 import shutil
 from pathlib import Path
 
+from sitl.fused import FUSED_FILE, SAID_FILE
 from sitl.plan import FlightPlan
 from vcl_companion.errors import ConfigError
 
 _MARK = Path("run") / "flight.json"
-_OWN_FILES = ("estimate.tum", "covariance.csv", "truth.tum", "received.jsonl", "attitude.csv")
+_OWN_FILES = (
+    *("estimate.tum", "covariance.csv", "truth.tum", "received.jsonl", "attitude.csv"),
+    *(FUSED_FILE, SAID_FILE),
+)
 _OWN_REPORTS = ("report.json", "report.html")
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl.absences import Absence, check_absences
+from sitl.firmware import FirmwareBinary
 from sitl.network import NetworkOptions
 from sitl.partitions import check_flying
 from vcl_companion.config import Config
@@ -50,6 +51,7 @@ class FlyOptions:
         seed: of the noise of the attitude, and of the network.
         network: how bad the radio between the drones is.
         absences: when whose daemon does not run.
+        firmware: real autopilot software in the stand-ins' place; None: stand-ins.
     """
 
     speed: float = 1.0
@@ -61,6 +63,7 @@ class FlyOptions:
     seed: int = 0
     network: NetworkOptions = field(default_factory=NetworkOptions)
     absences: tuple[Absence, ...] = ()
+    firmware: FirmwareBinary | None = None
 
     def __post_init__(self) -> None:
         if not self.speed > 0.0:
@@ -69,6 +72,8 @@ class FlyOptions:
             raise ConfigError(f"--start-timeout must be positive, got {self.start_timeout_s}")
         if self.seed < 0:
             raise ConfigError(f"--seed must not be negative, got {self.seed}")
+        if self.firmware and self.attitude:
+            raise ConfigError("--attitude: a real --autopilot has an attitude of its own")
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +192,7 @@ def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:
             raise ConfigError(f"--drones: {recording.path} has no {name!r} ({', '.join(names)})")
     flying = [name for name in names if not options.drones or name in options.drones]
     drones = tuple(
-        PlannedDrone(drone, n + 1, _attitude_path(drone, options.attitude))
+        PlannedDrone(drone, n + 1, _attitude_path(drone, options))
         for n, drone in enumerate(recording.drones)
         if drone.name in flying
     )
@@ -203,13 +208,16 @@ def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:
     return plan
 
 
-def _attitude_path(drone: Drone, earlier: Path | None) -> Path | None:
+def _attitude_path(drone: Drone, options: FlyOptions) -> Path | None:
+    earlier = options.attitude
     if earlier is not None:
         path = earlier / drone.name / "attitude.csv"
         if not path.is_file():
             raise ConfigError(f"--attitude {earlier}: no {drone.name}/attitude.csv in it")
         return path.resolve()
     if drone.truth is None:
+        if options.firmware:
+            raise ConfigError(f"--autopilot: {drone.name} has no ground truth to move it along")
         raise ConfigError(
             f"{drone.name} has no ground truth to make the autopilot's attitude of; "
             "give --attitude DIR, the --out of an earlier flight"

@@ -17,6 +17,7 @@ Terms beyond ``sitl.evaluation``'s:
 * ``relies_on``: share of the frames whose sent pose relies on the map by ``patches`` or by
   ``features``, on a ``peer`` alone, on attitude and ``motion`` alone, or where ``nothing``
   was sent.
+* ``fused``: what a real autopilot made of our poses (``sitl.fused``); null for a stand-in.
 * ``lives``: each run of its daemon, in seconds of the recording: when its process was
   ``started_s``, when it was ``ready_s`` (it had connected to its camera, and begins to speak to
   autopilot and peers; starting an interpreter and compiling is before), and when it was
@@ -35,6 +36,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +44,7 @@ import numpy as np
 
 from sitl.lives_report import lives_of
 from sitl.network_report import options_of, peer_link_of
-from sitl.plan import pipeline_of
+from sitl.plan import FlyOptions, pipeline_of
 from sitl.reliance import shares
 from sitl.report_page import page
 from sitl.result import DroneResult, FlightResult
@@ -91,7 +93,9 @@ def report_of(result: FlightResult) -> dict[str, Any]:
                 f"{_name(result, a)}:{_name(result, b)}": distance_m
                 for a, b, distance_m in plan.known_distances
             },
-            "attitude": "replayed" if options.attitude else "from truth with noise",
+            "autopilot": options.firmware.kind if options.firmware else "stand-in",
+            "parameters": dict(options.firmware.parameters) if options.firmware else {},
+            "attitude": _attitude_of(options),
             "seed": options.seed,
             "network": options_of(options.network),
             "start_timeout_s": options.start_timeout_s,
@@ -122,6 +126,12 @@ def report_of(result: FlightResult) -> dict[str, Any]:
     return {**rounded(report), "options": report["options"]}
 
 
+def _attitude_of(options: FlyOptions) -> str:
+    if options.firmware:
+        return "the autopilot's own"
+    return "replayed" if options.attitude else "from truth with noise"
+
+
 def _drone(drone: DroneResult, duration_s: float) -> dict[str, Any]:
     scores, log, summary = drone.scores, drone.log, drone.log.summary
     first = [f.latency_ms for f in log.frames if f.sequence == 0]
@@ -150,6 +160,7 @@ def _drone(drone: DroneResult, duration_s: float) -> dict[str, Any]:
         "within_3_sigma_or_10cm_share": scores.within_3_sigma_or_10cm_share if scores else None,
         "nees_median": scores.nees_median if scores else None,
         "relies_on": shares(log.frames),
+        "fused": asdict(drone.fused) if drone.fused else None,
         "sources": _sources(drone),
         "latency_ms": {
             name: _percentile(looked_at, share)

@@ -7,6 +7,7 @@ from html import escape
 from typing import Any
 
 from sitl import report_plots
+from sitl.fused import fused_html
 from sitl.lives_report import lives_html
 from sitl.network_report import network_html, network_text
 from sitl.page_style import document, section
@@ -42,7 +43,7 @@ def page(result: FlightResult, report: Mapping[str, Any]) -> str:
     """Return the whole page of a flight; ``report`` is what ``report.json`` says."""
     name = escape(str(report["recording"]))
     errors = report_plots.errors_svg(result)
-    network, lives = network_html(report), lives_html(report)
+    network, lives, fused = network_html(report), lives_html(report), fused_html(report)
     parts = [
         _alarms(report),
         section("Where they flew", _flight_note(result), report_plots.trajectories_svg(result)),
@@ -50,6 +51,7 @@ def page(result: FlightResult, report: Mapping[str, Any]) -> str:
         section("What the poses rely on", _RELIANCE_NOTE,
                  strips_svg(result) + _reliance_table(report)),
         section("Whence the poses", _SOURCE_NOTE, _source_table(report)),
+        section("What the autopilots made of it", _FUSED_NOTE, fused) if fused else "",
         section("Lives of the daemons", _LIVES_NOTE, lives) if lives else "",
         section("Error along every axis", _ERROR_NOTE, errors) if errors else "",
         section("Tracked landmarks", "", report_plots.landmarks_svg(result)),
@@ -89,6 +91,12 @@ _LATENCY_NOTE = (
     "first frame waits for the first map and is told apart."
 )
 
+_FUSED_NOTE = (
+    "The firmware's own position (LOCAL_POSITION_NED) against the truth, from two seconds after "
+    "the first pose and where its estimator says that it has one; ours beside it, as it was sent. "
+    "Ahead: its position is that of so much later an instant, as it takes our poses for so much "
+    "older than they are; the firmware's parameter of their delay is too large by that."
+)
 _LIVES_NOTE = (
     "Seconds of the recording at which a daemon was started, was ready (had connected to its "
     "camera) and was killed. From ready, in seconds of the wall clock: to its first map, to one "

@@ -18,6 +18,7 @@ from sitl.evaluation import (
     scores,
 )
 from sitl.flight_log import FlightLog, MapRow, estimates_of, read_received
+from sitl.fused import Fused, read_fused
 from sitl.lives import Life, Lives, read_lives, read_log
 from sitl.network_log import NetworkLog, read_network_log
 from sitl.plan import FlightPlan, PlannedDrone
@@ -58,6 +59,7 @@ class DroneResult:
         scores: those errors in numbers.
         alone: the same of what was fused: ``intra``, the frames' own fixes, and
             ``inter``, the peers' proposals, each as it came; only those there were.
+        fused: what a real autopilot made of what it was sent; None without one.
         given: (G,) which frames a living daemon was given.
         lives: of its daemon, in order.
     """
@@ -71,6 +73,7 @@ class DroneResult:
     errors: PoseErrors | None
     scores: Scores | None
     alone: Mapping[str, Scores]
+    fused: Fused | None
     given: NDArray[np.int64]
     lives: tuple[Life, ...]
 
@@ -155,7 +158,9 @@ def gather(plan: FlightPlan, out: Path, events: Iterable[Event] = ()) -> FlightR
     network = read_network_log(out)
     alignment = _alignment(*heard[plan.leader], truths[plan.leader])
     drones = tuple(
-        _drone_result(d, truths[d.name], *heard[d.name], logs[d.name], alignment, lives.get(d.name))
+        _drone_result(
+            d, out, truths[d.name], *heard[d.name], logs[d.name], alignment, lives.get(d.name)
+        )
         for d in plan.drones
     )
     mapped_by = _whose_maps(plan, logs, lives)
@@ -180,6 +185,7 @@ def gather(plan: FlightPlan, out: Path, events: Iterable[Event] = ()) -> FlightR
 
 def _drone_result(
     planned: PlannedDrone,
+    out: Path,
     truth: tuple[Pose | None, ...],
     estimates: Estimates,
     frame_of: NDArray[np.int64],
@@ -203,6 +209,7 @@ def _drone_result(
         errors=errors if errors is not None and len(errors.at_ns) else None,
         scores=scores(errors, axes) if errors is not None else None,
         alone={} if alignment is None else _alone(planned, truth, log, alignment, axes),
+        fused=read_fused(out / planned.name, estimates, planned.drone.truth, alignment),
         given=np.array(every if lives is None else lives.frames, dtype=np.int64),
         lives=() if lives is None else tuple(lives.lives),
     )

@@ -15,7 +15,8 @@ from sitl.plan import FlightPlan, PlannedDrone
 from sitl.processes import Child, FlightError, start_child
 from vcl_companion.recording import Trajectory
 
-_REPLY_TIMEOUT_S = 20.0
+# A firmware that is just started lives through a minute of its own time first.
+_REPLY_TIMEOUT_S = 120.0
 # Autopilots were switched on one after the other, well before the flight.
 _BOOTED_BEFORE_NS = 60_000_000_000
 _BOOTED_APART_NS = 7_000_000_000
@@ -73,9 +74,10 @@ async def start_stand_in(
     path = folder / "stand_in.json"
     config = stand_in_config(plan, planned, out)
     path.write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
+    module = "stand_in" if plan.options.firmware is None else plan.options.firmware.kind
     return await start_child(
-        f"stand-in autopilot of {planned.name}",
-        (sys.executable, "-m", "sitl.autopilots.stand_in", str(path)),
+        f"autopilot of {planned.name}",
+        (sys.executable, "-m", f"sitl.autopilots.{module}", str(path)),
         log_prefix=folder / "stand_in",
         environment=environment,
         piped=True,
@@ -83,7 +85,7 @@ async def start_stand_in(
 
 
 def stand_in_config(plan: FlightPlan, planned: PlannedDrone, out: Path) -> dict[str, Any]:
-    """Return a stand-in's configuration; writes the truth it measures, if it does, to a file."""
+    """Return an autopilot's configuration; writes the truth it measures, if it does, to a file."""
     if planned.attitude_path is not None:
         attitude: dict[str, Any] = {"source": "replay", "file": str(planned.attitude_path)}
     else:
@@ -100,9 +102,22 @@ def stand_in_config(plan: FlightPlan, planned: PlannedDrone, out: Path) -> dict[
         "system_id": planned.system_id,
         "boot_offset_ns": plan.starts_at_ns - booted_before_ns,
         "attitude": attitude,
+        **_firmware_config(plan, out / "run" / planned.name / "firmware"),
         # An autopilot has a processor of its own.
         "realtime": not math.isinf(plan.options.speed),
         "out": str(out / planned.name),
+    }
+
+
+def _firmware_config(plan: FlightPlan, run: Path) -> dict[str, Any]:
+    firmware, speed = plan.options.firmware, plan.options.speed
+    if firmware is None:
+        return {}
+    return {
+        "binary": str(firmware.path),
+        "parameters": dict(firmware.parameters),
+        "run": str(run),
+        "speed": 0.0 if math.isinf(speed) else speed,
     }
 
 

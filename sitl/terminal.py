@@ -15,6 +15,7 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from sitl.fly import Progress
+from sitl.fused import FUSED_COLUMNS, fused_cells
 from sitl.goals import Goal
 from sitl.lives_report import LIFE_COLUMNS, life_rows
 from sitl.network_report import DELAYS, NETWORK_COLUMNS, delay_text, message_rows
@@ -79,6 +80,7 @@ def show_report(console: Console, report: Mapping[str, Any], out: Path) -> None:
             _number(drone["resident_mb"], 0),
         )
     console.print(table)
+    _show_fused(console, report)
     lives = life_rows(report)
     if lives:
         heads = (label.replace(" s", "\ns") for _, label in LIFE_COLUMNS)
@@ -92,6 +94,23 @@ def show_report(console: Console, report: Mapping[str, Any], out: Path) -> None:
             text = f"ATTENTION {event['drone']}: {event['reason']}"
             console.print(text, style="bold red", markup=False, highlight=False)
     console.print(f"report: {out / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _show_fused(console: Console, report: Mapping[str, Any]) -> None:
+    """Print what real autopilots made of the poses."""
+    said = {name: drone["fused"] for name, drone in report["drones"].items() if drone["fused"]}
+    if not said:
+        return
+    heads = (_broken(label) for _, label, _, _ in FUSED_COLUMNS)
+    table = _numbers(("autopilot", *heads))
+    for name, fused in said.items():
+        table.add_row(name, *fused_cells(fused, none="-"))
+    console.print(table)
+
+
+def _broken(label: str) -> str:
+    """Return a head with its unit on a line of its own."""
+    return "\n".join(label.rsplit(" ", 1))
 
 
 def _show_network(console: Console, report: Mapping[str, Any]) -> None:

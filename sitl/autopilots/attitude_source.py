@@ -61,7 +61,7 @@ class TruthAttitude:
     """
 
     def __init__(self, path: Path, rate_hz: float, errors: AttitudeErrors, seed: int) -> None:
-        table = _read_table(path, 8)
+        table = read_table(path, 8)
         self._at_ns = table[0]
         self._rotations = [matrix_from_quaternion(q) for q in table[1][:, 3:7]]
         self._period_ns = round(1e9 / rate_hz)
@@ -106,7 +106,7 @@ class ReplayedAttitude:
     """The samples of an earlier flight, unchanged."""
 
     def __init__(self, path: Path) -> None:
-        self._at_ns, self._quaternions = _read_table(path, 5)
+        self._at_ns, self._quaternions = read_table(path, 5)
 
     def between(self, after_ns: int | None, until_ns: int) -> list[tuple[int, Array]]:
         """Return the samples due (see ``AttitudeSource``)."""
@@ -118,7 +118,7 @@ class ReplayedAttitude:
         return [(int(self._at_ns[i]), self._quaternions[i]) for i in range(first, last)]
 
 
-def _read_table(path: Path, n_columns: int) -> tuple[NDArray[np.int64], Array]:
+def read_table(path: Path, n_columns: int) -> tuple[NDArray[np.int64], Array]:
     """Return (T,) rising instants, ns, and the (T, n_columns - 1) other columns of a CSV file.
 
     Raises:

@@ -1,17 +1,8 @@
 """A stand-in for an autopilot: ``python -m sitl.autopilots.stand_in CONFIG.json``.
 
-It speaks MAVLink over UDP like an ArduPilot quadrotor's component 1 and keeps
-everything it hears. Its time is a recording's, moved on by JSON lines:
-
-    stdout {"port": P}              ready; the companion sends to 127.0.0.1:P
-    stdin  {"advance_to_ns": t}     send what is due up to t
-    stdout {"at_ns": t, "times_told": n}
-                                    all of it has been handed to the kernel; n
-                                    TIMESYNC questions answered so far
-    stdin  {"finish": true}         write what was heard and end
-
-The end of stdin ends it as well. Only heartbeats go by the wall clock, since
-they say that a process lives while a recording's time stands still.
+It speaks MAVLink over UDP like an ArduPilot quadrotor's component 1 and keeps everything it
+hears. Its time is a recording's (``steered``); only heartbeats go by the wall clock, since they
+say that a process lives while a recording's time stands still.
 
 Configuration: ``system_id``, ``boot_offset_ns`` (its boot clock is recording time minus
 this), ``attitude`` {``source`` "truth" or "replay", ``file``, and for truth ``seed``,
@@ -23,13 +14,10 @@ what it decodes is a second opinion.
 from __future__ import annotations
 
 import json
-import os
-import selectors
 import socket
 import sys
 import time
 from collections import deque
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
@@ -43,6 +31,8 @@ from sitl.autopilots.attitude_source import (
     ReplayedAttitude,
     TruthAttitude,
 )
+from sitl.autopilots.hearing import Hearing, datagrams
+from sitl.autopilots.steered import open_udp, run_steered, serve
 from vcl_companion.daemon.scheduling import run_before_others
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.rotation import Array, euler_from_matrix, matrix_from_quaternion
@@ -51,8 +41,6 @@ _HEARTBEAT_S = 1.0
 _TIMESYNC_PERIOD_NS = 100_000_000
 # What a companion that connects late is given of the stream it missed.
 _BACKLOG_NS = 1_000_000_000
-_MAX_DATAGRAM_BYTES = 65535
-_MAX_LINE_BYTES = 65536
 
 
 @dataclass(frozen=True)
@@ -118,7 +106,7 @@ class StandIn:
         self._options = options
         self._udp = udp
         self._attitudes = attitudes
-        self._received = received
+        self._hearing = Hearing(received)
         self._mav = dialect.MAVLink(None, srcSystem=options.system_id, srcComponent=1)
         self._now_ns: int | None = None
         self._companion: tuple[str, int] | None = None
@@ -150,57 +138,38 @@ class StandIn:
 
     def receive(self) -> None:
         """Take in every datagram that has arrived."""
-        while True:
-            try:
-                data, sender = self._udp.recvfrom(_MAX_DATAGRAM_BYTES, socket.MSG_DONTWAIT)
-            except BlockingIOError:
-                return
-            # A parser of its own for each datagram: no rest of one can spoil the next.
-            parser = dialect.MAVLink(None)
-            parser.robust_parsing = True
-            for message in parser.parse_buffer(data) or []:
-                self._hear(message, sender)
+        for data, sender in datagrams(self._udp):
+            for message in self._hearing.of(data, self._now_ns):
+                if message.get_srcSystem() != self._options.system_id:
+                    continue
+                if sender != self._companion:
+                    self._greet(sender)
+                self._answer(message, message.get_type())
 
     def heartbeat_if_due(self) -> float:
         """Send HEARTBEAT when a second has passed; return the seconds to the next."""
         now_s = time.monotonic()
         if now_s >= self._next_heartbeat_s:
             self._next_heartbeat_s = now_s + _HEARTBEAT_S
-            self._send(
-                dialect.MAVLink_heartbeat_message(
-                    dialect.MAV_TYPE_QUADROTOR,
-                    dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
-                    dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED,
-                    4,  # ArduCopter's GUIDED
-                    dialect.MAV_STATE_ACTIVE,
-                    3,
-                )
-            )
+            self._beat()
         return max(0.0, self._next_heartbeat_s - now_s)
 
-    def _hear(self, message: Any, sender: tuple[str, int]) -> None:
-        kind = message.get_type()
-        fields = {key: value for key, value in message.to_dict().items() if key != "mavpackettype"}
-        if kind in ("BAD_DATA",) or kind.startswith("UNKNOWN"):
-            fields = {"bytes": bytes(message.data).hex(), "reason": str(fields.get("reason", ""))}
-        line = {
-            "arrived_at_ns": self._now_ns,
-            "arrived_monotonic_ns": time.monotonic_ns(),
-            "system": message.get_srcSystem(),
-            "component": message.get_srcComponent(),
-            "type": kind,
-            "fields": fields,
-        }
-        self._received.write(json.dumps(line) + "\n")
-        if kind == "BAD_DATA" or message.get_srcSystem() != self._options.system_id:
-            return
-        if sender != self._companion:
-            self._greet(sender)
-        self._answer(message, kind)
+    def _beat(self) -> None:
+        self._send(
+            dialect.MAVLink_heartbeat_message(
+                dialect.MAV_TYPE_QUADROTOR,
+                dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
+                dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED,
+                4,  # ArduCopter's GUIDED
+                dialect.MAV_STATE_ACTIVE,
+                3,
+            )
+        )
 
     def _greet(self, companion: tuple[str, int]) -> None:
         """Talk to a companion from now on, and give it the newest of what it missed."""
         self._companion = companion
+        self._beat()
         for _, frame in self._backlog:
             self._udp.sendto(frame, companion)
 
@@ -254,90 +223,23 @@ class StandIn:
         return frame
 
 
-def obey(stand_in: StandIn, command: Mapping[str, object]) -> dict[str, int] | None:
-    """Carry out one control line; return the answer, None at the end.
-
-    Raises:
-        ConfigError: the command is not known.
-    """
-    match command:
-        case {"advance_to_ns": int(at_ns)}:
-            now_ns = stand_in.advance_to(at_ns)
-            return {"at_ns": now_ns, "times_told": stand_in.n_times_told}
-        case {"finish": True}:
-            return None
-    raise ConfigError(f"control: unknown command {json.dumps(command)}")
-
-
 def run(options: StandInOptions) -> None:
     """Serve until told to finish, or until stdin ends."""
     options.out.mkdir(parents=True, exist_ok=True)
     if options.realtime:
         run_before_others()
     with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp,
+        open_udp() as udp,
         (options.out / "attitude.csv").open("w", buffering=1) as attitudes,
         (options.out / "received.jsonl").open("w", buffering=1) as received,
-        selectors.DefaultSelector() as selector,
     ):
-        udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-        udp.bind(("127.0.0.1", 0))
         attitudes.write("at_ns,qw,qx,qy,qz\n")
-        stand_in = StandIn(options, udp, attitudes, received)
-        selector.register(udp, selectors.EVENT_READ)
-        selector.register(sys.stdin.fileno(), selectors.EVENT_READ)
-        _say({"port": udp.getsockname()[1]})
-        unread = b""
-        while True:
-            ready = selector.select(stand_in.heartbeat_if_due())
-            stand_in.receive()
-            if not any(key.fileobj == sys.stdin.fileno() for key, _ in ready):
-                continue
-            read = os.read(sys.stdin.fileno(), _MAX_LINE_BYTES)
-            if not read:
-                return
-            *lines, unread = (unread + read).split(b"\n")
-            if len(unread) > _MAX_LINE_BYTES:
-                raise ConfigError("control: a line is too long")
-            for line in lines:
-                answer = obey(stand_in, _command(line))
-                if answer is None:
-                    stand_in.receive()
-                    return
-                _say(answer)
-
-
-def _command(line: bytes) -> Mapping[str, object]:
-    try:
-        command = json.loads(line)
-    except ValueError as error:
-        raise ConfigError(f"control: {error}") from error
-    if not isinstance(command, dict):
-        raise ConfigError(f"control: expected an object, got {command!r}")
-    return command
-
-
-def _say(answer: Mapping[str, int]) -> None:
-    sys.stdout.write(json.dumps(answer) + "\n")
-    sys.stdout.flush()
+        serve(StandIn(options, udp, attitudes, received), udp)
 
 
 def main(arguments: list[str]) -> int:
     """Run from the command line; return the exit code."""
-    if len(arguments) != 1:
-        sys.stderr.write("usage: python -m sitl.autopilots.stand_in CONFIG.json\n")
-        return 2
-    try:
-        run(read_options(Path(arguments[0])))
-    except ConfigError as error:
-        sys.stderr.write(f"stand_in: {error}\n")
-        return 2
-    except KeyboardInterrupt:
-        return 130
-    except BrokenPipeError:
-        # Whoever steered us is gone.
-        return 1
-    return 0
+    return run_steered("stand_in", arguments, lambda path: run(read_options(path)))
 
 
 if __name__ == "__main__":

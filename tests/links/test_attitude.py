@@ -122,3 +122,52 @@ def test_without_timesync_the_quickest_arrival_sets_the_time() -> None:
     offset_ns = ours.offset_by_arrival_ns()
     assert offset_ns is not None
     assert -MS < offset_ns - OFFSET_NS < 2 * MS
+
+
+NORTH_RAD = np.deg2rad(5.0)
+
+
+def flown(at_boot_ns: list[int], turned_from_ns: int, noise_deg: float = 0.0) -> AttitudeHistory:
+    """A history of one whose autopilot turns its north by 5 degrees at an instant."""
+    rng = np.random.default_rng(2)
+    ours = history()
+    for boot_ns in at_boot_ns:
+        one = sample(boot_ns)
+        north = NORTH_RAD if boot_ns >= turned_from_ns else 0.0
+        noise = exp_so3(rng.normal(0.0, np.deg2rad(noise_deg), 3))
+        turned = exp_so3(np.array([0.0, 0.0, north])) @ one.ned_from_body @ noise
+        taken = ours.add(AttitudeSample(1, 1, one.time_boot_ms, turned, "quaternion"), 0)
+        first = min(b for b in (*at_boot_ns, 10**12) if b >= turned_from_ns)
+        assert taken == ("turned" if boot_ns == first else "taken")
+    return ours
+
+
+def test_an_autopilot_that_turns_its_north_does_not_turn_the_drone() -> None:
+    times = list(range(1000 * MS, 3000 * MS, 20 * MS))
+    ours = flown(times, 2000 * MS)
+    assert np.isclose(ours.north_rad, NORTH_RAD, rtol=1e-3)
+    for at_ns in (1500 * MS, 1999 * MS, 2003 * MS, 2900 * MS):
+        attitude = ours.at(at_ns + OFFSET_NS + MS // 2, OFFSET_NS)
+        assert attitude is not None
+        assert angle(attitude.ned_from_body, true_at(at_ns)) < np.deg2rad(0.1)
+
+
+def test_noise_and_lost_samples_are_no_turn_of_the_north() -> None:
+    rng = np.random.default_rng(3)
+    times = [t for t in range(1000 * MS, 5000 * MS, 20 * MS) if rng.random() > 0.3]
+    ours = flown(times, 10**12, noise_deg=0.2)
+    assert ours.north_rad == 0.0
+
+
+def test_a_drone_that_begins_to_spin_turns_itself() -> None:
+    ours = history()
+    for k in range(100):
+        heading = 0.5 * 15.0 * max(0.0, (k - 20) * 0.02) ** 2  # 15 rad/s^2
+        turned = exp_so3(np.array([0.0, 0.0, heading]))
+        assert ours.add(AttitudeSample(1, 1, 1000 + 20 * k, turned, "quaternion"), 0) == "taken"
+
+
+def test_a_restarted_autopilot_has_a_new_north() -> None:
+    ours = flown(list(range(5000 * MS, 7000 * MS, 20 * MS)), 6000 * MS)
+    assert ours.add(sample(100 * MS), 0) == "rebooted"
+    assert ours.north_rad == 0.0

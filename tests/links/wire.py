@@ -6,7 +6,7 @@ from typing import Any
 
 # message id: CRC_EXTRA, https://mavlink.io/en/messages/ardupilotmega.html
 HEARTBEAT, ATTITUDE, ATTITUDE_QUATERNION, COMMAND_LONG, COMMAND_ACK = 0, 30, 31, 76, 77
-VISION_POSITION_ESTIMATE, TIMESYNC, STATUSTEXT, TUNNEL = 102, 111, 253, 385
+VISION_POSITION_ESTIMATE, TIMESYNC, STATUSTEXT, ODOMETRY, TUNNEL = 102, 111, 253, 331, 385
 CRC_EXTRA = {
     HEARTBEAT: 50,
     ATTITUDE: 39,
@@ -16,6 +16,7 @@ CRC_EXTRA = {
     VISION_POSITION_ESTIMATE: 158,
     TIMESYNC: 34,
     STATUSTEXT: 83,
+    ODOMETRY: 91,
     TUNNEL: 147,
 }
 # Fields on the wire stand by falling size, extensions last.
@@ -28,6 +29,8 @@ LAYOUT = {
     VISION_POSITION_ESTIMATE: struct.Struct("<Q6f21fB"),
     TIMESYNC: struct.Struct("<qq"),
     STATUSTEXT: struct.Struct("<B50sHB"),
+    # usec xyz q v rates 21 of the pose 21 of the twist frame child reset estimator quality
+    ODOMETRY: struct.Struct("<Q3f4f3f3f21f21fBBBBb"),
     TUNNEL: struct.Struct("<HBBB128s"),
 }
 

@@ -350,6 +350,22 @@ def test_a_turn_against_the_autopilot_is_refused() -> None:
     assert refused == NotLocalized("turned 12 degrees against the autopilot's attitude", 100, 90)
 
 
+def test_an_autopilot_that_errs_by_a_few_degrees_is_not_believed_and_no_jump() -> None:
+    """Seen of ArduPilot: two degrees within a second, as it begins to use our poses."""
+    state = settled(np.eye(3))
+    predicted = predict(state, 15 * STEP_NS, np.eye(3), FilterOptions())
+    assert predicted is not None
+    turned = exp_so3(np.deg2rad([1.5, -1.0, 3.0]))
+    expected = predicted.world_from_body.translation
+    after = update(predicted, fix_at(Pose(turned, expected)))
+    assert isinstance(after, FilterState)
+    assert after.n_jumps == state.n_jumps
+    assert np.linalg.norm(log_so3(turned.T @ after.world_from_body.rotation)) < np.deg2rad(0.1)
+    # The same turn somewhere else is another place that looks alike.
+    elsewhere = update(predicted, fix_at(Pose(turned, expected + np.array([0.0, 4.0, 0.0]))))
+    assert isinstance(elsewhere, NotLocalized)
+
+
 def test_a_turn_the_autopilot_saw_too_is_taken() -> None:
     turned = exp_so3(np.array([0.0, 0.0, np.deg2rad(60.0)]))
     predicted = predict(settled(np.eye(3)), 15 * STEP_NS, turned, FilterOptions())

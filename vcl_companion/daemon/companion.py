@@ -22,6 +22,7 @@ from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.vision_pose import PoseEstimate
 from vcl_companion.localization.intra import Localized, NotLocalized
 from vcl_companion.localization.pipeline import Effort, PipelineOptions, is_doubtful, localize
 from vcl_companion.localization.pose_filter import FilterState, NotFused
@@ -455,11 +456,17 @@ class Companion:
 
     def _tell(self, state: FilterState, at_ns: int) -> bool:
         """Send the autopilot a state's pose in the frame that it knows; whether that can be."""
+        local_from_world = self._estimator.local_from_world
+        turn = local_from_world.rotation
         return self._autopilot.send_pose(
-            self._estimator.local_from_world @ state.world_from_body,
-            state.pose_covariance(),
-            at_ns,
-            self._estimator.n_resets,
+            PoseEstimate(
+                local_from_world @ state.world_from_body,
+                state.pose_covariance(),
+                turn @ state.velocity_world,
+                turn @ state.velocity_covariance() @ turn.T,
+                at_ns,
+                self._estimator.n_resets,
+            )
         )
 
     def _give_up(self, frame: Frame, why: NotLocalized) -> None:

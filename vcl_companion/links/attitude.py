@@ -3,13 +3,17 @@
 An attitude carries the autopilot's milliseconds since its start. They are
 turned into our time only when an attitude is asked for, by the best offset
 known then.
+
+An autopilot that begins to take its heading from our poses turns its north at once, by what it
+was wrong. Nobody turns so fast: its attitudes are told on as if it had not.
 """
 
 from __future__ import annotations
 
 import bisect
+import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -29,7 +33,12 @@ _ARRIVALS = 128
 _CARRIED_NS = 25_000_000
 _CARRIED_STEPS = 1.25
 
-Taken = Literal["taken", "overtaken", "rebooted"]
+# What a heading changes by beyond its last rate is the autopilot's doing when it is more than
+# the noise of two samples, and more than a drone can accelerate its turn.
+_HEADING_NOISE_RAD = math.radians(1.5)
+_HEADING_ACCELERATION_RAD_S2 = 20.0
+
+Taken = Literal["taken", "overtaken", "rebooted", "turned"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +73,18 @@ class AttitudeHistory:
         self._max_age_ns = max_age_ns
         self._samples: deque[AttitudeSample] = deque(maxlen=_MAX_SAMPLES)
         self._arrivals: deque[int] = deque(maxlen=_ARRIVALS)
+        self._north_rad = 0.0
+
+    @property
+    def north_rad(self) -> float:
+        """By how much the autopilot has turned its north since its first sample, rad."""
+        return self._north_rad
 
     def add(self, sample: AttitudeSample, arrived_at_ns: int) -> Taken:
-        """Take a sample in; one of an autopilot that has restarted clears those before."""
+        """Take a sample in; one of an autopilot that has restarted clears those before.
+
+        After one that has turned its north all are told in the north of those before.
+        """
         taken: Taken = "taken"
         if self._samples:
             later_ms = sample.time_boot_ms - self._samples[-1].time_boot_ms
@@ -77,6 +95,13 @@ class AttitudeHistory:
                 return "overtaken"
             elif later_ms == 0:
                 self._samples.pop()
+        sample = self._in_first_north(sample)
+        step_rad = self._turned_by(sample)
+        if step_rad:
+            taken = "turned"
+            self._north_rad += step_rad
+            turned_back = _about_down(-step_rad) @ sample.ned_from_body
+            sample = replace(sample, ned_from_body=turned_back)
         self._samples.append(sample)
         self._arrivals.append(arrived_at_ns - self._measured_ns(sample))
         return taken
@@ -85,6 +110,7 @@ class AttitudeHistory:
         """Forget all samples."""
         self._samples.clear()
         self._arrivals.clear()
+        self._north_rad = 0.0
 
     def offset_by_arrival_ns(self) -> int | None:
         """Return our clock minus the autopilot's, judged by when samples came, ns.
@@ -149,6 +175,26 @@ class AttitudeHistory:
             return None
         return ahead_ns / step_ns
 
+    def _in_first_north(self, sample: AttitudeSample) -> AttitudeSample:
+        if self._north_rad == 0.0:
+            return sample
+        return replace(sample, ned_from_body=_about_down(-self._north_rad) @ sample.ned_from_body)
+
+    def _turned_by(self, sample: AttitudeSample) -> float:
+        """Return by how much the autopilot turned its north before a sample, rad; 0 if not."""
+        if len(self._samples) < 2:
+            return 0.0
+        before, last = self._samples[-2], self._samples[-1]
+        step_s = (self._measured_ns(last) - self._measured_ns(before)) * 1e-9
+        since_s = (self._measured_ns(sample) - self._measured_ns(last)) * 1e-9
+        if step_s <= 0.0:
+            return 0.0
+        expected_rad = _heading_change(before, last) * since_s / step_s
+        beyond_rad = _heading_change(last, sample) - expected_rad
+        possible_rad = _HEADING_NOISE_RAD * max(1.0, since_s / step_s)
+        possible_rad += _HEADING_ACCELERATION_RAD_S2 * since_s * max(step_s, since_s)
+        return beyond_rad if abs(beyond_rad) > possible_rad else 0.0
+
     def _newest_ns(self, offset_ns: int) -> int:
         return self._measured_ns(self._samples[-1]) + offset_ns
 
@@ -156,6 +202,15 @@ class AttitudeHistory:
     def _measured_ns(sample: AttitudeSample) -> int:
         """Return the likeliest instant of a sample by the autopilot's clock, ns."""
         return sample.time_boot_ms * _NS_PER_MS + _CUT_OFF_NS
+
+
+def _heading_change(before: AttitudeSample, after: AttitudeSample) -> float:
+    """Return by how much a body turned about the vertical from one sample to another, rad."""
+    return float(log_so3(after.ned_from_body @ before.ned_from_body.T)[2])
+
+
+def _about_down(angle_rad: float) -> Array:
+    return np.asarray(exp_so3(np.array([0.0, 0.0, angle_rad])))
 
 
 def _on_arc(before: AttitudeSample, after: AttitudeSample, fraction: float) -> Array:

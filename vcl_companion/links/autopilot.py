@@ -7,28 +7,35 @@ import enum
 import logging
 import math
 from dataclasses import dataclass
-
-import numpy as np
+from typing import Literal
 
 from vcl_companion.clock import Clock
 from vcl_companion.errors import ConfigError
-from vcl_companion.geometry.pose import Pose, euler_pose_covariance
-from vcl_companion.geometry.rotation import Array, euler_from_matrix
+from vcl_companion.geometry.rotation import euler_from_matrix, quaternion_from_matrix
 from vcl_companion.links.attitude import Attitude, AttitudeHistory
 from vcl_companion.links.counters import LinkCounters, LinkTally
 from vcl_companion.links.mavlink import (
     ATTITUDE_QUATERNION_ID,
     COMPONENT_AUTOPILOT,
     COMPONENT_COMPANION,
+    FRAME_LOCAL_FRD,
+    FRAME_LOCAL_NED,
     RESULT_ACCEPTED,
     SET_MESSAGE_INTERVAL,
     STATUS_TEXT_BYTES,
     Codec,
 )
-from vcl_companion.links.messages import AttitudeSample, CommandAck, Message, Timesync
+from vcl_companion.links.messages import (
+    AttitudeSample,
+    CommandAck,
+    Heartbeat,
+    Message,
+    Timesync,
+)
 from vcl_companion.links.reconnect import Address
 from vcl_companion.links.timesync import TimesyncEstimator
 from vcl_companion.links.transport import check_allowed_senders, open_transport, parse_link
+from vcl_companion.links.vision_pose import Firmware, PoseEstimate, covariance_for, firmware_of
 
 _log = logging.getLogger(__name__)
 
@@ -41,9 +48,9 @@ _SYNC_GIVEN_UP = 10
 _STREAM_CHECK_S = 1.0
 _STREAM_LONGEST_PAUSE_S = 16.0
 _MAX_TEXT_BYTES = 8 * STATUS_TEXT_BYTES
-# Rounding leaves a zero variance a little negative; more than this is an error.
-_NEGATIVE_VARIANCE = -1e-9
-_MAX_FLOAT32 = 3.4e38
+# 0 is what an autopilot that has heard of none takes for known.
+_RESETS = 255
+_FIRMWARE = {"ardupilot": Firmware.ARDUPILOT, "px4": Firmware.PX4}
 
 
 class ServiceState(enum.Enum):
@@ -77,6 +84,12 @@ class AutopilotOptions:
         attitude_rate_hz: rate of ATTITUDE_QUATERNION that we ask for.
         attitude_latency_s: from measuring to arriving, for an autopilot without TIMESYNC.
         max_attitude_age_s: how far from a frame's instant an attitude may be.
+        profile: whose reading of a pose's covariance it is made for: ``ardupilot`` or ``px4``;
+            ``auto``: whose the autopilot's HEARTBEAT says it is; ``plain``: as it is.
+        message: in which poses are sent: ``vision_position_estimate``, or ``odometry``, which
+            holds the velocity as well.
+        time_error_s: how well the autopilot knows the instant of a pose, 1 sigma: what it is
+            told is uncertain by so much of the way.
     """
 
     link: str = "serial:/dev/serial0:921600"
@@ -84,6 +97,9 @@ class AutopilotOptions:
     attitude_rate_hz: float = 50.0
     attitude_latency_s: float = 0.01
     max_attitude_age_s: float = 0.1
+    profile: Literal["auto", "ardupilot", "px4", "plain"] = "auto"
+    message: Literal["vision_position_estimate", "odometry"] = "vision_position_estimate"
+    time_error_s: float = 0.005
 
     def __post_init__(self) -> None:
         parse_link(self.link)
@@ -96,6 +112,8 @@ class AutopilotOptions:
             raise ConfigError(
                 f"max_attitude_age_s: must be above 0 up to 2, got {self.max_attitude_age_s}"
             )
+        if not 0.0 <= self.time_error_s <= 0.1:
+            raise ConfigError(f"time_error_s: must be in 0..0.1, got {self.time_error_s}")
 
 
 class AutopilotLink:
@@ -119,6 +137,8 @@ class AutopilotLink:
         self._asked_at_s = -math.inf
         self._news = asyncio.Event()
         self._state = ServiceState.STARTING
+        self._firmware = _FIRMWARE.get(options.profile, Firmware.OTHER)
+        self._first_reset: int | None = None
         self._said: tuple[Severity, str] | None = None
         self._n_long_texts = 0
 
@@ -169,46 +189,51 @@ class AutopilotLink:
             return None
         return self._history(at_ns, offset_ns).at(at_ns, offset_ns)
 
-    def send_pose(
-        self, world_from_body: Pose, covariance: Array, at_ns: int, reset_counter: int
-    ) -> bool:
-        """Send VISION_POSITION_ESTIMATE.
-
-        Args:
-            world_from_body: the pose, world NED-like.
-            covariance: (6, 6) local perturbation (``geometry/pose.py``), m and rad.
-            at_ns: when the picture was taken, our clock.
-            reset_counter: bumped at every real jump of the frame; sent modulo 256.
+    def send_pose(self, estimate: PoseEstimate) -> bool:
+        """Send where we were, as the autopilot's firmware wants to be told.
 
         Returns:
             False when the covariance is not finite or has a negative variance:
-            nothing was sent, and it is counted. An autopilot takes partial NaN or
-            a negative variance as an internal error.
+            nothing was sent, and it is counted.
         """
-        if covariance.shape != (6, 6):
-            raise ValueError(f"a pose covariance is (6, 6), got {covariance.shape}")
-        with np.errstate(all="ignore"):
-            sent = euler_pose_covariance(world_from_body, covariance)
-        numbers = np.concatenate([sent.ravel(), world_from_body.translation])
-        if not np.all(np.abs(numbers) < _MAX_FLOAT32):
-            self._tally.refuse("pose not sent: not finite")
+        covariance = covariance_for(self._firmware, estimate, self._options.time_error_s)
+        if isinstance(covariance, str):
+            self._tally.refuse(f"pose not sent: {covariance}")
             return False
-        variances = np.diag(sent)
-        if variances.min() < _NEGATIVE_VARIANCE * max(1.0, float(variances.max())):
-            self._tally.refuse("pose not sent: negative variance")
-            return False
-        np.fill_diagonal(sent, np.maximum(variances, 0.0))
-        x_m, y_m, z_m = world_from_body.translation.tolist()
-        self._transport.write(
-            self._codec.vision_position_estimate(
-                at_ns // 1000,
-                (x_m, y_m, z_m),
-                euler_from_matrix(world_from_body.rotation),
-                sent,
-                reset_counter % 256,
+        pose = estimate.local_from_body
+        x_m, y_m, z_m = pose.translation.tolist()
+        usec, reset_counter = estimate.at_ns // 1000, self._reset_counter(estimate.n_resets)
+        if self._options.message == "vision_position_estimate":
+            angles = euler_from_matrix(pose.rotation)
+            frame = self._codec.vision_position_estimate(
+                usec, (x_m, y_m, z_m), angles, covariance, reset_counter
             )
-        )
+        else:
+            turn = pose.rotation.T
+            # ArduPilot drops what is not FRD; PX4 takes FRD for turned, and NED as it is.
+            is_px4 = self._firmware is Firmware.PX4
+            frame = self._codec.odometry(
+                usec,
+                FRAME_LOCAL_NED if is_px4 else FRAME_LOCAL_FRD,
+                (x_m, y_m, z_m),
+                tuple(quaternion_from_matrix(pose.rotation).tolist()),
+                tuple((turn @ estimate.velocity_local_m_s).tolist()),
+                covariance,
+                turn @ estimate.velocity_covariance @ turn.T,
+                reset_counter,
+            )
+        self._transport.write(frame)
         return True
+
+    def _reset_counter(self, n_resets: int) -> int:
+        """Return a counter that is not the autopilot's own first one, nor our last run's.
+
+        An ArduPilot that has heard of no reset begins at its origin. Its first pose then, 2.7 m
+        from there, is a step to it, and not a beginning: it believed to fly at 75 m/s.
+        """
+        if self._first_reset is None:
+            self._first_reset = self._clock.now_ns() // 1_000_000_000
+        return 1 + (self._first_reset + n_resets) % _RESETS
 
     def set_state(self, state: ServiceState) -> None:
         """Say from the next heartbeat on how we are."""
@@ -280,10 +305,17 @@ class AutopilotLink:
                 self._wake()
             case AttitudeSample():
                 self._take_attitude(message)
+            case Heartbeat(autopilot=autopilot) if self._options.profile == "auto":
+                self._is_of(firmware_of(autopilot))
             case CommandAck(command=command, result=result, target_system=target):
                 for_us = target in (0, self._system_id) and command == SET_MESSAGE_INTERVAL
                 if for_us and result != RESULT_ACCEPTED:
                     _log.warning("the autopilot refuses to stream attitude (result %d)", result)
+
+    def _is_of(self, firmware: Firmware) -> None:
+        if firmware is not self._firmware:
+            self._firmware = firmware
+            _log.info("the autopilot's firmware: %s", firmware.value)
 
     def _take_attitude(self, sample: AttitudeSample) -> None:
         quaternion = sample.source == "quaternion"
@@ -292,6 +324,9 @@ class AutopilotLink:
         match history.add(sample, self._clock.now_ns()):
             case "overtaken":
                 self._tally.refuse("attitude overtaken by a later one")
+            case "turned":
+                degrees = math.degrees(history.north_rad)
+                _log.info("the autopilot has turned its north, by %.1f degrees so far", degrees)
             case "rebooted":
                 _log.warning("the autopilot has restarted")
                 self._sync.reset()

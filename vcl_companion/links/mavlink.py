@@ -57,6 +57,7 @@ STATUS_TEXT_BYTES = 50
 SET_MESSAGE_INTERVAL = 511
 ATTITUDE_QUATERNION_ID = 31
 RESULT_ACCEPTED = 0
+FRAME_LOCAL_NED, FRAME_LOCAL_FRD = 1, 20
 
 _MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
 _OVERHEAD_1, _OVERHEAD_2 = 8, 12
@@ -284,6 +285,41 @@ class Codec:
                 usec, *position_m, *euler_rad, upper, reset_counter
             )
         )
+
+    def odometry(
+        self,
+        usec: int,
+        frame: int,
+        position_m: tuple[float, float, float],
+        quaternion: tuple[float, float, float, float],
+        velocity_body_m_s: tuple[float, float, float],
+        covariance: Array,
+        velocity_covariance: Array,
+        reset_counter: int,
+    ) -> bytes:
+        """Return an ODOMETRY of a vision estimator, velocities in BODY_FRD; no angular rates.
+
+        Args:
+            usec: instant of the measurement, us of the clock that answers TIMESYNC.
+            frame: MAV_FRAME of the pose.
+            position_m: x y z, NED-like.
+            quaternion: w x y z, local_from_body.
+            velocity_body_m_s: forward, right, down.
+            covariance: (6, 6) of position and roll pitch yaw, m and rad.
+            velocity_covariance: (3, 3) of the velocity, m^2/s^2.
+            reset_counter: 0..255.
+        """
+        rates = np.full((6, 6), np.nan)
+        rates[:3, :3] = velocity_covariance
+        upper = np.triu_indices(6)
+        return self._pack(
+            dialect.MAVLink_odometry_message(
+                usec, frame, dialect.MAV_FRAME_BODY_FRD, *position_m, quaternion,
+                *velocity_body_m_s, math.nan, math.nan, math.nan,
+                covariance[upper].tolist(), rates[upper].tolist(), reset_counter,
+                dialect.MAV_ESTIMATOR_TYPE_VISION, 0,
+            )
+        )  # fmt: skip
 
 
 class _AddressedTimesync(dialect.MAVLink_timesync_message):  # type: ignore[misc]  # untyped

@@ -26,7 +26,10 @@ from vcl_companion.localization.intra import Localized, NotLocalized, Prior
 _P, _B, _V, _W = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 _N_OWN = 12
 # 99.99 % of chi^2 with 6 and with 3 degrees of freedom: beyond, it is not noise.
-_GATE_POSE, _GATE_ROTATION = 27.9, 21.1
+_GATE_POSE, _GATE_ROTATION, _GATE_POSITION = 27.9, 21.1, 21.1
+# An autopilot that takes its attitude from our poses in part, as it does while they begin, errs
+# by degrees that its noise does not tell of; by more it is never wrong without saying so.
+_MOST_TURNED_RAD = np.deg2rad(6.0)
 # What is known after a jump, 1 sigma: nothing.
 _FORGOTTEN_M, _FORGOTTEN_M_S, _FORGOTTEN_RAD = 1e3, 10.0, np.pi
 _MAX_COAST_S = 60.0
@@ -109,6 +112,10 @@ class FilterState:
         to_pose = _to_pose(self.world_from_body.rotation, len(self.covariance))
         out = to_pose @ self.covariance @ to_pose.T + self.own_map_covariance
         return np.asarray(0.5 * (out + out.T))
+
+    def velocity_covariance(self) -> Array:
+        """Return (3, 3) covariance of the velocity, world axes, m^2/s^2."""
+        return np.array(self.covariance[_V, _V])
 
     def prior(self) -> Prior:
         """Return where the drone is expected, for guiding the matching."""
@@ -258,7 +265,8 @@ def update(predicted: FilterState, fix: Localized) -> FilterState | NotLocalized
     A fix whose position the covariances cannot explain (a relocalization, a
     prediction gone wrong) replaces position and speed and counts as a jump. One
     whose rotation contradicts the autopilot's turn since the last fix is wrong:
-    repeated structure, a planar twin. Where the autopilot sends no attitude, a
+    repeated structure, a planar twin; but for a few degrees at the place where the drone was
+    expected, which are the autopilot's own. Where the autopilot sends no attitude, a
     jump replaces the rotation as well.
     """
     predicted = _with_map(predicted, fix)
@@ -268,12 +276,16 @@ def update(predicted: FilterState, fix: Localized) -> FilterState | NotLocalized
     expected = observation @ predicted.covariance @ observation.T + noise
     distance = innovation[3:] @ np.linalg.solve(expected[3:, 3:], innovation[3:])
     if distance > _GATE_ROTATION and predicted.ned_from_body is not None:
-        degrees = np.rad2deg(np.linalg.norm(innovation[3:]))
-        return NotLocalized(
-            f"turned {degrees:.0f} degrees against the autopilot's attitude",
-            fix.n_matched,
-            fix.n_inliers,
-        )
+        turned_rad = float(np.linalg.norm(innovation[3:]))
+        away = innovation[:3] @ np.linalg.solve(expected[:3, :3], innovation[:3])
+        if turned_rad > _MOST_TURNED_RAD or away > _GATE_POSITION:
+            return NotLocalized(
+                f"turned {np.rad2deg(turned_rad):.0f} degrees against the autopilot's attitude",
+                fix.n_matched,
+                fix.n_inliers,
+            )
+        predicted = _doubting_attitude(predicted, turned_rad)
+        expected = observation @ predicted.covariance @ observation.T + noise
     if innovation @ np.linalg.solve(expected, innovation) > _GATE_POSE:
         predicted = _forgotten(predicted)
         expected = observation @ predicted.covariance @ observation.T + noise
@@ -441,6 +453,13 @@ def _with_map(state: FilterState, fix: Localized) -> FilterState:
     covariance = np.zeros((_N_OWN + n_map, _N_OWN + n_map))
     covariance[:_N_OWN, :_N_OWN] = state.covariance[:_N_OWN, :_N_OWN]
     covariance[_N_OWN:, _N_OWN:] = fix.keyframe_covariance
+    return replace(state, covariance=covariance)
+
+
+def _doubting_attitude(state: FilterState, turned_rad: float) -> FilterState:
+    """Return the state with the attitude's offset as uncertain as it has just been seen to be."""
+    covariance = state.covariance.copy()
+    covariance[_B, _B] += turned_rad**2 * np.eye(3)
     return replace(state, covariance=covariance)
 
 

@@ -1,0 +1,142 @@
+"""A real autopilot in a recorded flight, or a program that speaks its interface."""
+
+import json
+import math
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sitl.autopilots.ardupilot import read_options
+from sitl.evaluation import Estimates
+from sitl.firmware import FirmwareBinary, parse_firmware
+from sitl.fly import fly
+from sitl.fused import read_fused
+from sitl.plan import FlyOptions
+from vcl_companion.errors import ConfigError, VclError
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.recording import Trajectory
+
+ROOT = Path(__file__).parents[2]
+DEMO = ROOT / "sitl" / "recordings" / "demo"
+_ARDUPILOT = os.environ.get("VCL_ARDUPILOT", "")
+
+
+def quiet(*_: object) -> None:
+    pass
+
+
+@pytest.fixture
+def vehicle(tmp_path: Path) -> Path:
+    """The program of ``json_vehicle`` where a firmware's binary would be."""
+    path = tmp_path / "arducopter"
+    script = ROOT / "tests" / "sitl" / "json_vehicle.py"
+    path.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{script}" "$@"\n')
+    path.chmod(0o755)
+    return path
+
+
+def flown(tmp_path: Path, firmware: FirmwareBinary, speed: float) -> dict[str, dict[str, float]]:
+    options = FlyOptions(speed=speed, firmware=firmware)
+    report = fly(DEMO, tmp_path / "out", options, quiet)
+    assert report["options"]["autopilot"] == "ardupilot"
+    for name, drone in report["drones"].items():
+        assert drone["localized_share"] == 1.0, name
+        assert drone["unaccounted"] == 0
+    return {name: drone["fused"] for name, drone in report["drones"].items()}
+
+
+def test_a_flight_moves_a_firmware_s_sensors_and_hands_it_our_poses(
+    tmp_path: Path, vehicle: Path
+) -> None:
+    fused = flown(tmp_path, parse_firmware(f"ardupilot={vehicle}"), math.inf)
+    for said in fused.values():
+        assert said["fused_after_s"] < 1.5
+        # It holds each pose until the next: what it is off by is the way between, and no more.
+        assert said["own_ate_m"] < 0.05
+        assert said["ate_m"] < 1.0
+    for name in fused:
+        attitudes = (tmp_path / "out" / name / "attitude.csv").read_text().splitlines()
+        assert len(attitudes) > 100
+        assert "estimator flags 0x33f" in (tmp_path / "out" / name / "said.csv").read_text()
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "What the autopilots made of it" in page
+
+
+def test_a_firmware_that_does_not_run_ends_the_flight_in_one_line(tmp_path: Path) -> None:
+    broken = tmp_path / "arducopter"
+    broken.write_text("#!/bin/sh\necho no such thing >&2\nexit 3\n")
+    broken.chmod(0o755)
+    with pytest.raises(VclError, match=r"firmware ended with exit code 3.*firmware\.log") as raised:
+        fly(
+            DEMO,
+            tmp_path / "out",
+            FlyOptions(firmware=parse_firmware(f"ardupilot={broken}")),
+            quiet,
+        )
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.skipif(not _ARDUPILOT, reason="VCL_ARDUPILOT names no arducopter")
+def test_a_real_arducopter_fuses_our_poses(tmp_path: Path) -> None:
+    for said in flown(tmp_path, parse_firmware(f"ardupilot={_ARDUPILOT}"), 0.7).values():
+        assert said["fused_after_s"] < 2.0
+        assert said["fused_share"] > 0.9
+        assert abs(said["ahead_ms"]) < 10.0
+        assert said["ate_m"] < 1.3 * said["own_ate_m"] + 0.01
+
+
+@pytest.mark.parametrize(
+    ("text", "parameters", "what"),
+    [
+        ("ardupilot", (), "expected"),
+        ("betaflight=/bin/true", (), "expected"),
+        ("ardupilot=/no/such/file", (), "is no program"),
+        ("ardupilot=/tmp", (), "is no program"),
+        ("ardupilot=/bin/true", ("VISO_DELAY_MS",), "NAME=NUMBER"),
+        ("ardupilot=/bin/true", ("viso=1",), "NAME=NUMBER"),
+        ("ardupilot=/bin/true", ("VISO_TYPE=much",), "NAME=NUMBER"),
+    ],
+)
+def test_what_is_no_firmware_is_refused(text: str, parameters: tuple[str, ...], what: str) -> None:
+    with pytest.raises(ConfigError, match=what):
+        parse_firmware(text, parameters)
+
+
+def test_parameters_are_named_with_the_firmware() -> None:
+    firmware = parse_firmware("ardupilot=/bin/true", ("VISO_DELAY_MS=20", "VISO_TYPE = 1"))
+    assert firmware.parameters == (("VISO_DELAY_MS", 20.0), ("VISO_TYPE", 1.0))
+
+
+def test_a_wrong_configuration_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "ardupilot.json"
+    path.write_text(json.dumps({"binary": "/bin/true"}))
+    with pytest.raises(ConfigError, match="key 'attitude' is missing"):
+        read_options(path)
+    path.write_text("{")
+    with pytest.raises(ConfigError, match=r"ardupilot\.json"):
+        read_options(path)
+
+
+def test_what_a_firmware_was_never_sent_it_has_not_fused(tmp_path: Path) -> None:
+    at_ns = np.arange(0, 10_000_000_000, 100_000_000, dtype=np.int64)
+    still = Trajectory(at_ns, np.zeros((100, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (100, 1)))
+    sent = Estimates(at_ns, (Pose.identity(),) * 100, np.zeros((100, 6, 6)))
+    assert read_fused(tmp_path, sent, still, Pose.identity()) is None
+    (tmp_path / "fused.csv").write_text("at_ns,x,y,z\n" + "".join(f"{t},1,0,0\n" for t in at_ns))
+    said = tmp_path / "said.csv"
+    said.write_text('at_ns,severity,text\n0,6,"estimator flags 0xa7"\n')
+    never = read_fused(tmp_path, sent, still, Pose.identity())
+    assert never is not None
+    assert (never.fused_after_s, never.fused_share, never.ate_m) == (None, 0.0, None)
+    said.write_text(
+        'at_ns,severity,text\n0,6,"estimator flags 0xa7"\n1000000000,6,"estimator flags 0x33f"\n'
+        '4000000000,6,"estimator flags 0xa7"\n'
+    )
+    some = read_fused(tmp_path, sent, still, Pose.identity())
+    assert some is not None
+    assert some.fused_after_s == 1.0
+    assert some.ate_m == 1.0
+    assert np.isclose(some.fused_share, 3.0 / 9.9)
