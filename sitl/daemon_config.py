@@ -48,7 +48,10 @@ def daemon_config(
             "leader": plan.system_id(plan.leader),
             "known_distances": [list(distance) for distance in plan.known_distances],
         },
-        "log": {"flight_log": str(run / "flight.jsonl")},
+        "log": {
+            "flight_log": str(run / "flight.jsonl"),
+            "status_file": str(run / "status.json"),
+        },
         "map": {"directory": str(run / "maps")},
     }
     if math.isinf(plan.options.speed):

@@ -102,6 +102,95 @@ def run(config_path: Path) -> None:
     os._exit(status)
 
 
+@main.command()
+@click.option(
+    "--config",
+    "config_path",
+    required=True,
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="The configuration of the daemon that runs.",
+)
+@click.option("--json", "as_json", is_flag=True, help="As its file has it.")
+def status(config_path: Path, as_json: bool) -> None:
+    """Say how the running daemon is, and whether the autopilot uses its poses.
+
+    Exit status: 0 when it does, 1 when not, or not any more, 2 when there is nothing to read.
+    """
+    from vcl_companion.config import load_config
+    from vcl_companion.daemon.status import read_status, status_json, status_lines
+
+    file = load_config(config_path).log.status_file
+    if not file:
+        raise ConfigError(f"{config_path}: [log] status_file: is not set; name a file there")
+    said = read_status(Path(file))
+    if as_json:
+        click.echo(status_json(said), nl=False)
+    else:
+        click.echo("\n".join(status_lines(said)))
+    if not said.is_good:
+        click.get_current_context().exit(1)
+
+
+@main.command()
+@click.option(
+    "--config",
+    "config_path",
+    required=True,
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="The configuration of the daemon, which must not run meanwhile.",
+)
+@click.option("--json", "as_json", is_flag=True, help="For programs; changes nothing.")
+@click.option("--fix", is_flag=True, help="Set the autopilot's parameters that are wrong.")
+@click.option("--yes", is_flag=True, help="With --fix or --restore: do not ask.")
+@click.option("--restore", is_flag=True, help="Put back what --fix has changed.")
+def check(config_path: Path, as_json: bool, fix: bool, yes: bool, restore: bool) -> None:
+    """Look before flight at what keeps the service and the autopilot from working together.
+
+    What --fix changes is kept beside the configuration, in NAME.parameters.json.
+    Exit status: 0 when nothing failed, 1 when something did, 2 when it cannot be looked at.
+    """
+    import asyncio
+
+    from vcl_companion.config import load_config
+    from vcl_companion.daemon.check import check_all, outcome_json, set_parameters
+    from vcl_companion.daemon.parameter_backup import read_before, write_before
+
+    if sum((as_json, fix, restore)) > 1:
+        raise ConfigError("check: --json, --fix and --restore are each for themselves")
+    config = load_config(config_path)
+    kept = config_path.with_suffix(".parameters.json")
+    context = click.get_current_context()
+    if restore:
+        wanted = read_before(kept)
+    else:
+        outcome = asyncio.run(check_all(config))
+        if as_json:
+            click.echo(outcome_json(outcome))
+        else:
+            for one in outcome.checks:
+                advice = f"; {one.advice}" if one.advice else ""
+                click.echo(f"{one.grade:8} {one.name:16} {one.what}{advice}")
+        wanted = {found.name: found.should_be for found in outcome.wrong if found.value is not None}
+        if not fix or not wanted:
+            context.exit(0 if outcome.is_good else 1)
+    for name, value in wanted.items():
+        click.echo(f"{name} = {value:g}")
+    if not yes and not click.confirm("Set these in the autopilot?"):
+        context.exit(1)
+    before, failed = asyncio.run(set_parameters(config, wanted))
+    if restore and not failed:
+        kept.unlink()
+    elif not restore and before:
+        write_before(kept, before)
+        click.echo(f"{kept}: what they were; --restore puts it back")
+    for name in failed:
+        click.echo(f"vcl: {name}: the autopilot did not take it", err=True)
+    click.echo("Restart the autopilot: some take effect only then.")
+    context.exit(1 if failed else 0)
+
+
 @main.group()
 def keys() -> None:
     """Make, install and look at the key that drones sign with."""

@@ -47,10 +47,13 @@ class LogOptions:
     Attributes:
         level: least severity of the messages on standard error.
         flight_log: file that gets one JSON line per frame and event; empty: none.
+        status_file: file that says every second how the service is, for ``vcl status``;
+            empty: none.
     """
 
     level: Literal["debug", "info", "warning", "error"] = "info"
     flight_log: str = ""
+    status_file: str = ""
 
 
 @dataclass(frozen=True)

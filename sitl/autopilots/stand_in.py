@@ -1,12 +1,14 @@
 """A stand-in for an autopilot: ``python -m sitl.autopilots.stand_in CONFIG.json``.
 
-It speaks MAVLink over UDP like an ArduPilot quadrotor's component 1 and keeps everything it
-hears. Its time is a recording's (``steered``); only heartbeats go by the wall clock, since they
-say that a process lives while a recording's time stands still.
+It speaks MAVLink over UDP like an ArduPilot quadrotor's component 1, fuses the poses that it is
+sent as that does (``fusing``), and keeps everything it hears. Its time is a recording's
+(``steered``); only heartbeats go by the wall clock, since they say that a process lives while a
+recording's time stands still.
 
 Configuration: ``system_id``, ``boot_offset_ns`` (its boot clock is recording time minus
 this), ``attitude`` {``source`` "truth" or "replay", ``file``, and for truth ``seed``,
-``tilt_bias_deg``, ``heading_bias_deg``, ``white_deg``, ``rate_hz``}, ``out`` (directory for
+``tilt_bias_deg``, ``heading_bias_deg``, ``white_deg``, ``rate_hz``}, ``parameters`` (name to
+value, those that are not as they should be; may be absent), ``out`` (directory for
 ``attitude.csv`` and ``received.jsonl``). It takes no encoding from the companion:
 what it decodes is a second opinion.
 """
@@ -18,7 +20,9 @@ import socket
 import sys
 import time
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -31,12 +35,32 @@ from sitl.autopilots.attitude_source import (
     ReplayedAttitude,
     TruthAttitude,
 )
+from sitl.autopilots.fusing import Fusing, VisionPose
 from sitl.autopilots.hearing import Hearing, datagrams
 from sitl.autopilots.steered import open_udp, run_steered, serve
 from vcl_companion.daemon.scheduling import run_before_others
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.rotation import Array, euler_from_matrix, matrix_from_quaternion
 
+# An ArduCopter's that flies on our poses.
+PARAMETERS = {
+    "AHRS_EKF_TYPE": 3.0,
+    "EK3_ENABLE": 1.0,
+    "VISO_TYPE": 1.0,
+    "VISO_ORIENT": 0.0,
+    "VISO_SCALE": 1.0,
+    "VISO_POS_X": 0.0,
+    "VISO_POS_Y": 0.0,
+    "VISO_POS_Z": 0.0,
+    "VISO_POS_M_NSE": 0.05,
+    "VISO_QUAL_MIN": 0.0,
+    "EK3_SRC1_POSXY": 6.0,
+    "EK3_SRC1_VELXY": 0.0,
+    "EK3_SRC1_POSZ": 6.0,
+    "EK3_SRC1_VELZ": 0.0,
+    "EK3_SRC1_YAW": 6.0,
+    "GPS1_TYPE": 0.0,
+}
 _HEARTBEAT_S = 1.0
 _TIMESYNC_PERIOD_NS = 100_000_000
 # What a companion that connects late is given of the stream it missed.
@@ -52,6 +76,7 @@ class StandInOptions:
         boot_offset_ns: recording time at the autopilot's start.
         source: where attitudes come from.
         out: directory for what it writes.
+        parameters: of its own, by name, besides those that fly on our poses.
         realtime: whether it goes before other programs on this machine, where that is permitted.
     """
 
@@ -60,6 +85,7 @@ class StandInOptions:
     source: AttitudeSource
     out: Path
     realtime: bool = False
+    parameters: Mapping[str, float] = field(default_factory=dict)
 
 
 def read_options(path: Path) -> StandInOptions:
@@ -90,6 +116,7 @@ def read_options(path: Path) -> StandInOptions:
             source,
             Path(config["out"]),
             bool(config.get("realtime", False)),
+            {str(name): float(value) for name, value in config.get("parameters", {}).items()},
         )
     except KeyError as error:
         raise ConfigError(f"{path}: key {error} is missing") from error
@@ -110,8 +137,15 @@ class StandIn:
         self._mav = dialect.MAVLink(None, srcSystem=options.system_id, srcComponent=1)
         self._now_ns: int | None = None
         self._companion: tuple[str, int] | None = None
+        self._fusing = Fusing()
+        self._interval_ns: dict[int, int] = {}
         self._backlog: deque[tuple[int, bytes]] = deque()
         self._next_heartbeat_s = 0.0
+        self._parameters = {**PARAMETERS, **options.parameters}
+        self._streams = {
+            dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT: self._send_estimator,
+            dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: self._send_position,
+        }
         self.n_times_told = 0
 
     def advance_to(self, until_ns: int) -> int:
@@ -119,20 +153,17 @@ class StandIn:
         self.receive()
         if self._now_ns is not None and until_ns <= self._now_ns:
             return self._now_ns
-        due: list[tuple[int, Array | None]] = [
-            (at_ns, quaternion)
+        due: list[tuple[int, Callable[[], None]]] = [
+            (at_ns, partial(self._send_attitude, at_ns, quaternion))
             for at_ns, quaternion in self._options.source.between(self._now_ns, until_ns)
         ]
         if self._now_ns is not None:
-            first = self._now_ns // _TIMESYNC_PERIOD_NS + 1
-            last = until_ns // _TIMESYNC_PERIOD_NS
-            due += [(k * _TIMESYNC_PERIOD_NS, None) for k in range(first, last + 1)]
-        for at_ns, quaternion in sorted(due, key=lambda item: item[0]):
+            due += _every(_TIMESYNC_PERIOD_NS, self._now_ns, until_ns, self._ask_for_time)
+            for message_id, interval_ns in self._interval_ns.items():
+                due += _every(interval_ns, self._now_ns, until_ns, self._streams[message_id])
+        for at_ns, send in sorted(due, key=lambda item: item[0]):
             self._now_ns = max(at_ns, self._now_ns or at_ns)
-            if quaternion is None:
-                self._ask_for_time()
-            else:
-                self._send_attitude(at_ns, quaternion)
+            send()
         self._now_ns = until_ns
         return until_ns
 
@@ -177,8 +208,31 @@ class StandIn:
         if kind == "TIMESYNC" and message.tc1 == 0 and self._now_ns is not None:
             self._send(dialect.MAVLink_timesync_message(max(1, self._boot_ns()), message.ts1))
             self.n_times_told += 1
+        elif kind in ("PARAM_REQUEST_READ", "PARAM_SET") and message.param_id in self._parameters:
+            if kind == "PARAM_SET":
+                self._parameters[message.param_id] = message.param_value
+            self._send(
+                dialect.MAVLink_param_value_message(
+                    message.param_id.encode(),
+                    self._parameters[message.param_id],
+                    dialect.MAV_PARAM_TYPE_REAL32,
+                    len(self._parameters),
+                    0xFFFF,
+                )
+            )
+        elif kind == "VISION_POSITION_ESTIMATE":
+            self._fusing.take(
+                VisionPose(
+                    1000 * message.usec,
+                    np.array([message.x, message.y, message.z]),
+                    message.covariance,
+                    message.reset_counter,
+                )
+            )
         elif kind == "COMMAND_LONG" and message.target_system == self._options.system_id:
             known = message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL
+            if known and int(message.param1) in self._streams and message.param2 >= 1000.0:
+                self._interval_ns[int(message.param1)] = round(1000.0 * message.param2)
             self._send(
                 dialect.MAVLink_command_ack_message(
                     message.command,
@@ -193,6 +247,23 @@ class StandIn:
     def _boot_ns(self) -> int:
         assert self._now_ns is not None
         return self._now_ns - self._options.boot_offset_ns
+
+    def _send_estimator(self) -> None:
+        assert self._now_ns is not None
+        self._send(
+            dialect.MAVLink_ekf_status_report_message(
+                self._fusing.flags(self._now_ns), 0.0, self._fusing.test_ratio, 0.0, 0.0, 0.0
+            )
+        )
+
+    def _send_position(self) -> None:
+        assert self._now_ns is not None
+        believed = self._fusing.at(self._now_ns)
+        if believed is not None:
+            boot_ms = self._boot_ns() // 1_000_000
+            self._send(
+                dialect.MAVLink_local_position_ned_message(boot_ms, *believed[0], *believed[1])
+            )
 
     def _ask_for_time(self) -> None:
         # Like ArduPilot, which tells its own questions from others by its system id in them.
@@ -221,6 +292,14 @@ class StandIn:
         if self._companion is not None:
             self._udp.sendto(frame, self._companion)
         return frame
+
+
+def _every(
+    period_ns: int, after_ns: int, until_ns: int, send: Callable[[], None]
+) -> list[tuple[int, Callable[[], None]]]:
+    """Return what is due at the multiples of a period in (after_ns, until_ns]."""
+    steps = range(after_ns // period_ns + 1, until_ns // period_ns + 1)
+    return [(k * period_ns, send) for k in steps]
 
 
 def run(options: StandInOptions) -> None:

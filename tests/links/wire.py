@@ -6,12 +6,16 @@ from typing import Any
 
 # message id: CRC_EXTRA, https://mavlink.io/en/messages/ardupilotmega.html
 HEARTBEAT, ATTITUDE, ATTITUDE_QUATERNION, COMMAND_LONG, COMMAND_ACK = 0, 30, 31, 76, 77
+PARAM_REQUEST_READ, PARAM_VALUE, PARAM_SET = 20, 22, 23
 VISION_POSITION_ESTIMATE, TIMESYNC, STATUSTEXT, ODOMETRY, TUNNEL = 102, 111, 253, 331, 385
 CRC_EXTRA = {
     HEARTBEAT: 50,
     ATTITUDE: 39,
     ATTITUDE_QUATERNION: 246,
     COMMAND_LONG: 152,
+    PARAM_REQUEST_READ: 214,
+    PARAM_VALUE: 220,
+    PARAM_SET: 168,
     COMMAND_ACK: 143,
     VISION_POSITION_ESTIMATE: 158,
     TIMESYNC: 34,
@@ -25,6 +29,9 @@ LAYOUT = {
     ATTITUDE: struct.Struct("<I6f"),
     ATTITUDE_QUATERNION: struct.Struct("<I7f4f"),
     COMMAND_LONG: struct.Struct("<7fHBBB"),
+    PARAM_REQUEST_READ: struct.Struct("<hBB16s"),
+    PARAM_VALUE: struct.Struct("<4sHH16sB"),
+    PARAM_SET: struct.Struct("<4sBB16sB"),
     COMMAND_ACK: struct.Struct("<HBBiBB"),
     VISION_POSITION_ESTIMATE: struct.Struct("<Q6f21fB"),
     TIMESYNC: struct.Struct("<qq"),

@@ -70,7 +70,11 @@ def test_a_daemon_is_told_where_things_are_and_nothing_of_the_truth(tmp_path: Pa
             "timestamp_file": str(run / "signing.json"),
         },
         "swarm": {"members": [1, 2, 3], "leader": 1, "known_distances": [[1, 2, 2.0]]},
-        "log": {"flight_log": str(run / "flight.jsonl"), "level": "debug"},
+        "log": {
+            "flight_log": str(run / "flight.jsonl"),
+            "status_file": str(run / "status.json"),
+            "level": "debug",
+        },
         "map": {"directory": str(run / "maps")},
     }
     assert tomllib.loads(toml_text(config)) == config

@@ -15,6 +15,7 @@ from sitl.firmware import FirmwareBinary, parse_firmware
 from sitl.fly import fly
 from sitl.fused import read_fused
 from sitl.plan import FlyOptions
+from vcl_companion.daemon.status import read_status
 from vcl_companion.errors import ConfigError, VclError
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.recording import Trajectory
@@ -61,6 +62,8 @@ def test_a_flight_moves_a_firmware_s_sensors_and_hands_it_our_poses(
         attitudes = (tmp_path / "out" / name / "attitude.csv").read_text().splitlines()
         assert len(attitudes) > 100
         assert "estimator flags 0x33f" in (tmp_path / "out" / name / "said.csv").read_text()
+        status = read_status(tmp_path / "out" / "run" / name / "status.json")
+        assert status.autopilot.firmware == "ardupilot"
     page = (tmp_path / "out" / "report.html").read_text()
     assert "What the autopilots made of it" in page
 
@@ -81,7 +84,8 @@ def test_a_firmware_that_does_not_run_ends_the_flight_in_one_line(tmp_path: Path
 
 @pytest.mark.skipif(not _ARDUPILOT, reason="VCL_ARDUPILOT names no arducopter")
 def test_a_real_arducopter_fuses_our_poses(tmp_path: Path) -> None:
-    for said in flown(tmp_path, parse_firmware(f"ardupilot={_ARDUPILOT}"), 0.7).values():
+    for name, said in flown(tmp_path, parse_firmware(f"ardupilot={_ARDUPILOT}"), 0.7).items():
+        assert read_status(tmp_path / "out" / "run" / name / "status.json").is_good
         assert said["fused_after_s"] < 2.0
         assert said["fused_share"] > 0.9
         assert abs(said["ahead_ms"]) < 10.0

@@ -28,7 +28,8 @@ from vcl_companion.geometry.rotation import (
     matrix_from_quaternion,
     quaternion_from_matrix,
 )
-from vcl_companion.links.autopilot import AutopilotLink, AutopilotOptions, ServiceState, Severity
+from vcl_companion.links.autopilot import AutopilotLink, AutopilotOptions, ServiceState
+from vcl_companion.links.texts import Severity
 from vcl_companion.links.vision_pose import PoseEstimate
 
 REPOSITORY = Path(__file__).parents[2]
@@ -465,4 +466,5 @@ def test_mavsdk_and_the_stand_in_decode_the_same(tmp_path: Path) -> None:
         mine = {k: v for k, v in mavsdk_pose.fields.items() if k in line["fields"]}
         assert mine == line["fields"]
     assert [line["fields"]["text"] for line in received(out, "STATUSTEXT")] == ["no map yet"]
-    assert {line["fields"]["param1"] for line in received(out, "COMMAND_LONG")} == {31.0}
+    asked = {line["fields"]["param1"] for line in received(out, "COMMAND_LONG")}
+    assert asked == {31.0, 32.0, 193.0}  # attitude, local position, estimator

@@ -30,6 +30,7 @@ from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.scheduling import run_before_others
+from vcl_companion.daemon.status_reporter import StatusReporter
 from vcl_companion.daemon.usage import (
     cpu_s,
     forget_peak,
@@ -219,6 +220,10 @@ async def _run(config: Config) -> int:
         disk,
     )
     exchange.attach(peers)
+    status_file = Path(config.log.status_file) if config.log.status_file else None
+    reporter = StatusReporter(
+        status_file, config.system_id, health, autopilot, estimator, maps, group, disk
+    )
     began_at_s, began_cpu_s = time.monotonic(), cpu_s()
     try:
         await _until_ended(
@@ -228,6 +233,7 @@ async def _run(config: Config) -> int:
             exchange.run(),
             companion.run(),
             health.run(),
+            reporter.run(),
             ends_all=companion.read_camera(),
         )
     finally:

@@ -80,6 +80,15 @@ class AttitudeHistory:
         """By how much the autopilot has turned its north since its first sample, rad."""
         return self._north_rad
 
+    @property
+    def rate_hz(self) -> float:
+        """How often samples were measured lately, Hz; 0 without two of them."""
+        if len(self._samples) < 2:
+            return 0.0
+        lately = [self._samples[i] for i in range(-min(len(self._samples), _ARRIVALS), 0)]
+        spanned_s = (lately[-1].time_boot_ms - lately[0].time_boot_ms) * 1e-3
+        return (len(lately) - 1) / spanned_s if spanned_s > 0.0 else 0.0
+
     def add(self, sample: AttitudeSample, arrived_at_ns: int) -> Taken:
         """Take a sample in; one of an autopilot that has restarted clears those before.
 

@@ -9,30 +9,41 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from vcl_companion.clock import Clock
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.rotation import euler_from_matrix, quaternion_from_matrix
 from vcl_companion.links.attitude import Attitude, AttitudeHistory
 from vcl_companion.links.counters import LinkCounters, LinkTally
+from vcl_companion.links.fusion import Fusion, FusionMonitor
 from vcl_companion.links.mavlink import (
     ATTITUDE_QUATERNION_ID,
     COMPONENT_AUTOPILOT,
     COMPONENT_COMPANION,
+    EKF_STATUS_REPORT_ID,
+    ESTIMATOR_STATUS_ID,
     FRAME_LOCAL_FRD,
     FRAME_LOCAL_NED,
+    LOCAL_POSITION_ID,
     RESULT_ACCEPTED,
     SET_MESSAGE_INTERVAL,
-    STATUS_TEXT_BYTES,
     Codec,
 )
 from vcl_companion.links.messages import (
     AttitudeSample,
     CommandAck,
+    EstimatorStatus,
     Heartbeat,
+    LocalPosition,
     Message,
+    ParameterValue,
     Timesync,
 )
+from vcl_companion.links.parameters import Parameters
 from vcl_companion.links.reconnect import Address
+from vcl_companion.links.stream_requests import StreamRequests
+from vcl_companion.links.texts import Severity, Texts
 from vcl_companion.links.timesync import TimesyncEstimator
 from vcl_companion.links.transport import check_allowed_senders, open_transport, parse_link
 from vcl_companion.links.vision_pose import Firmware, PoseEstimate, covariance_for, firmware_of
@@ -45,9 +56,6 @@ _SYNC_FAST_S, _SYNC_SLOW_S = 0.1, 1.0
 _SYNC_ENOUGH = 8
 # After this many unanswered questions (1 s) the autopilot does without TIMESYNC.
 _SYNC_GIVEN_UP = 10
-_STREAM_CHECK_S = 1.0
-_STREAM_LONGEST_PAUSE_S = 16.0
-_MAX_TEXT_BYTES = 8 * STATUS_TEXT_BYTES
 # 0 is what an autopilot that has heard of none takes for known.
 _RESETS = 255
 _FIRMWARE = {"ardupilot": Firmware.ARDUPILOT, "px4": Firmware.PX4}
@@ -61,17 +69,6 @@ class ServiceState(enum.Enum):
     ACTIVE = 4
     CRITICAL = 5
     STALLED = 0
-
-
-class Severity(enum.IntEnum):
-    """MAV_SEVERITY."""
-
-    CRITICAL = 2
-    ERROR = 3
-    WARNING = 4
-    NOTICE = 5
-    INFO = 6
-    DEBUG = 7
 
 
 @dataclass(frozen=True)
@@ -132,15 +129,17 @@ class AutopilotLink:
         max_age_ns = round(options.max_attitude_age_s * 1e9)
         self._by_quaternion = AttitudeHistory(latency_ns, max_age_ns)
         self._by_euler = AttitudeHistory(latency_ns, max_age_ns)
-        self._n_quaternions = 0
+        self._streams = StreamRequests(options.attitude_rate_hz, self._request_stream)
+        self._texts = Texts(self._codec, self._transport)
+        self._parameters = Parameters(self._read_parameter, self._write_parameter)
+        self._fusion = FusionMonitor()
         self._sync = TimesyncEstimator()
         self._asked_at_s = -math.inf
         self._news = asyncio.Event()
         self._state = ServiceState.STARTING
         self._firmware = _FIRMWARE.get(options.profile, Firmware.OTHER)
+        self._streams.firmware = self._firmware
         self._first_reset: int | None = None
-        self._said: tuple[Severity, str] | None = None
-        self._n_long_texts = 0
 
     @property
     def counters(self) -> LinkCounters:
@@ -158,7 +157,34 @@ class AutopilotLink:
             group.create_task(self._transport.run(self._receive, self._greet))
             group.create_task(self._heartbeats())
             group.create_task(self._questions())
-            group.create_task(self._stream_requests())
+            group.create_task(self._streams.run())
+
+    @property
+    def firmware(self) -> Firmware:
+        """Whose software the autopilot runs, as far as is known."""
+        return self._firmware
+
+    @property
+    def attitude_rate_hz(self) -> float:
+        """How often ATTITUDE_QUATERNION came in the last seconds, Hz."""
+        return self._by_quaternion.rate_hz
+
+    async def parameter(self, name: str) -> float | None:
+        """Return one of the autopilot's parameters; None when it has none of the name."""
+        return await self._parameters.value(name, self._firmware)
+
+    async def set_parameter(self, name: str, value: float) -> float | None:
+        """Set one of the autopilot's parameters; return what it is then, None if it is not said."""
+        return await self._parameters.set(name, value, self._firmware)
+
+    def fusion(self) -> Fusion:
+        """Return what becomes of our poses, by what the autopilot says of itself."""
+        return self._fusion.state(self._clock.now_ns())
+
+    @property
+    def ahead_s(self) -> float | None:
+        """By how much the autopilot takes our poses for older than they are, s; None: unknown."""
+        return self._fusion.ahead_s
 
     async def attitude_at(self, at_ns: int, wait_s: float) -> Attitude | None:
         """Return the attitude at an instant of our clock.
@@ -223,6 +249,8 @@ class AutopilotLink:
                 reset_counter,
             )
         self._transport.write(frame)
+        sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0))
+        self._fusion.sent(estimate.at_ns, pose.translation, sigma_m)
         return True
 
     def _reset_counter(self, n_resets: int) -> int:
@@ -241,27 +269,11 @@ class AutopilotLink:
 
     def say(self, severity: Severity, text: str) -> None:
         """Send STATUSTEXT, unless it was the last one said; said again when a link comes back."""
-        if self._said == (severity, text):
-            return
-        self._said = (severity, text)
-        self._send_text(severity, text)
+        self._texts.say(severity, text)
 
     def announce(self, severity: Severity, text: str) -> None:
         """Send STATUSTEXT of something that has happened: once, whatever the link does."""
-        self._send_text(severity, text)
-
-    def _send_text(self, severity: Severity, text: str) -> None:
-        # Ground stations differ in what they make of a character cut in two by a chunk.
-        data = text.encode("ascii", "replace")[:_MAX_TEXT_BYTES]
-        if len(data) <= STATUS_TEXT_BYTES:
-            self._transport.write(self._codec.status_text(severity, data, 0, 0))
-            return
-        self._n_long_texts += 1
-        text_id = (self._n_long_texts - 1) % 65535 + 1
-        # A zero byte ends the text: a last chunk that is full needs an empty one after it.
-        for chunk in range(len(data) // STATUS_TEXT_BYTES + 1):
-            part = data[chunk * STATUS_TEXT_BYTES : (chunk + 1) * STATUS_TEXT_BYTES]
-            self._transport.write(self._codec.status_text(severity, part, text_id, chunk))
+        self._texts.announce(severity, text)
 
     def _history(self, at_ns: int, offset_ns: int) -> AttitudeHistory:
         if self._by_quaternion.is_near(at_ns, offset_ns):
@@ -305,6 +317,15 @@ class AutopilotLink:
                 self._wake()
             case AttitudeSample():
                 self._take_attitude(message)
+            case ParameterValue():
+                self._parameters.answered(message)
+            case EstimatorStatus():
+                for message_id in (EKF_STATUS_REPORT_ID, ESTIMATOR_STATUS_ID):
+                    self._streams.heard(message_id)
+                self._fusion.reported(message, self._clock.now_ns())
+            case LocalPosition():
+                self._streams.heard(LOCAL_POSITION_ID)
+                self._take_position(message)
             case Heartbeat(autopilot=autopilot) if self._options.profile == "auto":
                 self._is_of(firmware_of(autopilot))
             case CommandAck(command=command, result=result, target_system=target):
@@ -312,14 +333,23 @@ class AutopilotLink:
                 if for_us and result != RESULT_ACCEPTED:
                     _log.warning("the autopilot refuses to stream attitude (result %d)", result)
 
+    def _take_position(self, message: LocalPosition) -> None:
+        offset_ns = self._offset_ns(self._clock.now_ns())
+        if offset_ns is not None:
+            measured_ns = message.time_boot_ms * 1_000_000 + offset_ns
+            self._fusion.believes(measured_ns, message.position, message.velocity)
+
     def _is_of(self, firmware: Firmware) -> None:
         if firmware is not self._firmware:
             self._firmware = firmware
             _log.info("the autopilot's firmware: %s", firmware.value)
+            self._streams.firmware = firmware
+            self._streams.ask_for_all()
 
     def _take_attitude(self, sample: AttitudeSample) -> None:
         quaternion = sample.source == "quaternion"
-        self._n_quaternions += quaternion
+        if quaternion:
+            self._streams.heard(ATTITUDE_QUATERNION_ID)
         history = self._by_quaternion if quaternion else self._by_euler
         match history.add(sample, self._clock.now_ns()):
             case "overtaken":
@@ -330,6 +360,7 @@ class AutopilotLink:
             case "rebooted":
                 _log.warning("the autopilot has restarted")
                 self._sync.reset()
+                self._fusion = FusionMonitor()
                 (self._by_euler if quaternion else self._by_quaternion).clear()
         self._wake()
 
@@ -342,9 +373,8 @@ class AutopilotLink:
         self._beat()
         if self._clock.now_ns() > 0:
             self._ask_if_due(0.0)
-        self._request_stream()
-        if self._said is not None:
-            self._send_text(*self._said)
+        self._streams.ask_for_all()
+        self._texts.say_again()
 
     def _beat(self) -> None:
         if self._state is not ServiceState.STALLED:
@@ -371,21 +401,13 @@ class AutopilotLink:
         self._asked_at_s = now_s
         self._transport.write(self._codec.timesync(0, self._sync.ask(self._clock.now_ns())))
 
-    def _request_stream(self) -> None:
-        interval_us = round(1e6 / self._options.attitude_rate_hz)
+    def _request_stream(self, message_id: int, interval_us: int) -> None:
         self._transport.write(
-            self._codec.set_message_interval(self._system_id, ATTITUDE_QUATERNION_ID, interval_us)
+            self._codec.set_message_interval(self._system_id, message_id, interval_us)
         )
 
-    async def _stream_requests(self) -> None:
-        """Ask for the stream while less than half of it comes, ever less often."""
-        pause_s = _STREAM_CHECK_S
-        while True:
-            n_before = self._n_quaternions
-            await asyncio.sleep(pause_s)
-            wanted = 0.5 * self._options.attitude_rate_hz * pause_s
-            if self._n_quaternions - n_before >= wanted:
-                pause_s = _STREAM_CHECK_S
-                continue
-            self._request_stream()
-            pause_s = min(2.0 * pause_s, _STREAM_LONGEST_PAUSE_S)
+    def _read_parameter(self, name: str) -> None:
+        self._transport.write(self._codec.read_parameter(self._system_id, name))
+
+    def _write_parameter(self, name: str, raw: bytes, kind: int) -> None:
+        self._transport.write(self._codec.set_parameter(self._system_id, name, raw, kind))

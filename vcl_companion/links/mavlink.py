@@ -34,8 +34,11 @@ from vcl_companion.links.messages import (
     AttitudeSample,
     CommandAck,
     CommandLong,
+    EstimatorStatus,
     Heartbeat,
+    LocalPosition,
     Message,
+    ParameterValue,
     StatusText,
     Timesync,
     Tunnel,
@@ -56,6 +59,9 @@ MAX_TUNNEL_BYTES = 128
 STATUS_TEXT_BYTES = 50
 SET_MESSAGE_INTERVAL = 511
 ATTITUDE_QUATERNION_ID = 31
+LOCAL_POSITION_ID = 32
+EKF_STATUS_REPORT_ID = 193
+ESTIMATOR_STATUS_ID = 230
 RESULT_ACCEPTED = 0
 FRAME_LOCAL_NED, FRAME_LOCAL_FRD = 1, 20
 
@@ -64,6 +70,8 @@ _OVERHEAD_1, _OVERHEAD_2 = 8, 12
 _HEAD_2 = 10
 _CHECKSUM_BYTES = 2
 _QUATERNION_NORM_TOLERANCE = 0.05
+# The same bits in EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS
+_POSITION_RELATIVE, _POSITION_ABSOLUTE, _POSITION_CONSTANT = 0x8, 0x10, 0x80
 
 # TIMESYNC with the extension fields that pymavlink's layout ends before
 # | 0  | i64 | tc1                                                    |
@@ -71,6 +79,14 @@ _QUATERNION_NORM_TOLERANCE = 0.05
 # | 16 | u8  | target system: of who is asked, or has asked; 0 for any |
 # | 17 | u8  | its component                                          |
 _TIMESYNC = struct.Struct("<qqBB")
+# PARAM_SET, its value as bytes: an integer's may be a float that is not a number
+# | 0  | 4s  | value            |
+# | 4  | u8  | target system    |
+# | 5  | u8  | its component    |
+# | 6  | 16s | name             |
+# | 22 | u8  | MAV_PARAM_TYPE   |
+_PARAMETER_SET = struct.Struct("<4sBB16sB")
+_VALUE_BYTES = 4
 
 
 class Codec:
@@ -262,6 +278,18 @@ class Codec:
             )
         )
 
+    def read_parameter(self, target_system: int, name: str) -> bytes:
+        """Return the PARAM_REQUEST_READ of an autopilot's parameter."""
+        return self._pack(
+            dialect.MAVLink_param_request_read_message(
+                target_system, COMPONENT_AUTOPILOT, name.encode("ascii"), -1
+            )
+        )
+
+    def set_parameter(self, target_system: int, name: str, raw: bytes, kind: int) -> bytes:
+        """Return the PARAM_SET of an autopilot's parameter: its value's four bytes and its type."""
+        return self._pack(_RawParameterSet(target_system, name.encode("ascii"), raw, kind))
+
     def vision_position_estimate(
         self,
         usec: int,
@@ -334,6 +362,17 @@ class _AddressedTimesync(dialect.MAVLink_timesync_message):  # type: ignore[misc
         return bytes(self._pack(mav, self.crc_extra, payload, force_mavlink1=force_mavlink1))
 
 
+class _RawParameterSet(dialect.MAVLink_param_set_message):  # type: ignore[misc]  # untyped
+    """A PARAM_SET whose value is four bytes."""
+
+    def __init__(self, target_system: int, name: bytes, raw: bytes, kind: int) -> None:
+        super().__init__(target_system, COMPONENT_AUTOPILOT, name, 0.0, kind)
+        self._body = _PARAMETER_SET.pack(raw, target_system, COMPONENT_AUTOPILOT, name, kind)
+
+    def pack(self, mav: Any, force_mavlink1: bool = False) -> bytes:
+        return bytes(self._pack(mav, self.crc_extra, self._body, force_mavlink1=force_mavlink1))
+
+
 def _next_magic(data: bytes, at: int) -> int:
     found = [i for i in (data.find(_MAGIC_1, at), data.find(_MAGIC_2, at)) if i >= 0]
     return min(found, default=len(data))
@@ -368,6 +407,28 @@ def _attitude_quaternion(m: Any, sender: _Sender) -> Message | str:
     return AttitudeSample(*sender, m.time_boot_ms, rotation, "quaternion")
 
 
+def _estimator(flags: int, ratio: float, sender: _Sender) -> Message | str:
+    if not math.isfinite(ratio):
+        return "estimator's test ratio is no number"
+    has_position = bool(flags & (_POSITION_RELATIVE | _POSITION_ABSOLUTE))
+    return EstimatorStatus(*sender, has_position, bool(flags & _POSITION_CONSTANT), ratio)
+
+
+def _ekf_status_report(m: Any, sender: _Sender) -> Message | str:
+    return _estimator(m.flags, m.pos_horiz_variance, sender)
+
+
+def _estimator_status(m: Any, sender: _Sender) -> Message | str:
+    return _estimator(m.flags, m.pos_horiz_ratio, sender)
+
+
+def _local_position(m: Any, sender: _Sender) -> Message | str:
+    values = np.array([m.x, m.y, m.z, m.vx, m.vy, m.vz])
+    if not np.all(np.isfinite(values)):
+        return "local position is no number"
+    return LocalPosition(*sender, m.time_boot_ms, values[:3], values[3:])
+
+
 def _tunnel(m: Any, sender: _Sender) -> Message | str:
     if m.payload_length > MAX_TUNNEL_BYTES:
         return "tunnel length is a lie"
@@ -375,6 +436,14 @@ def _tunnel(m: Any, sender: _Sender) -> Message | str:
         return "tunnel for another component"
     payload = bytes(m.payload[: m.payload_length])
     return Tunnel(*sender, m.target_system, m.payload_type, payload)
+
+
+def _parameter_value(m: Any, sender: _Sender) -> Message | str:
+    name = m.param_id if isinstance(m.param_id, str) else m.param_id.decode("ascii", "replace")
+    # The value's bytes are an integer's for some: what they were as a float must not be lost.
+    frame = m.get_msgbuf()
+    raw = bytes(frame[_HEAD_2 : _HEAD_2 + min(frame[1], _VALUE_BYTES)]).ljust(_VALUE_BYTES, b"\0")
+    return ParameterValue(*sender, name.rstrip("\0"), raw, m.param_type)
 
 
 def _status_text(m: Any, sender: _Sender) -> Message | str:
@@ -398,6 +467,10 @@ _READERS: dict[int, Callable[[Any, _Sender], Message | str]] = {
     dialect.MAVLINK_MSG_ID_TIMESYNC: _timesync,
     dialect.MAVLINK_MSG_ID_ATTITUDE: _attitude,
     dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: _attitude_quaternion,
+    dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _ekf_status_report,
+    dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS: _estimator_status,
+    dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _local_position,
+    dialect.MAVLINK_MSG_ID_PARAM_VALUE: _parameter_value,
     dialect.MAVLINK_MSG_ID_TUNNEL: _tunnel,
     dialect.MAVLINK_MSG_ID_STATUSTEXT: _status_text,
     dialect.MAVLINK_MSG_ID_COMMAND_LONG: _command_long,

@@ -113,3 +113,42 @@ class CommandAck(Message):
     result: int
     target_system: int
     target_component: int
+
+
+@dataclass(frozen=True)
+class EstimatorStatus(Message):
+    """What an autopilot says of its estimator: EKF_STATUS_REPORT or ESTIMATOR_STATUS.
+
+    Attributes:
+        has_position: whether it has a horizontal position, relative or absolute.
+        holds_position: whether it holds that for constant, having nothing to tell it by.
+        position_test_ratio: innovation of horizontal position by what may be; above 1 refused.
+    """
+
+    has_position: bool
+    holds_position: bool
+    position_test_ratio: float
+
+
+@dataclass(frozen=True, eq=False)
+class LocalPosition(Message):
+    """Where an autopilot believes to be by its own clock: (3,) NED from its origin, m and m/s."""
+
+    time_boot_ms: int
+    position: Array
+    velocity: Array
+
+
+@dataclass(frozen=True)
+class ParameterValue(Message):
+    """One of an autopilot's parameters.
+
+    Attributes:
+        name: up to 16 characters.
+        raw: the four bytes of its value, as they came.
+        kind: MAV_PARAM_TYPE.
+    """
+
+    name: str
+    raw: bytes
+    kind: int

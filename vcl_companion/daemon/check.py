@@ -1,0 +1,156 @@
+"""``vcl check``: before flight, what keeps the service or the autopilot from working together.
+
+The service must not run meanwhile: the check uses its links and its camera.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+
+from vcl_companion.clock import SystemClock
+from vcl_companion.config import Config
+from vcl_companion.daemon.check_host import Check, Grade, of_camera, of_files, of_wall_clock
+from vcl_companion.daemon.parameter_rules import Finding, findings, names_of, rules_for
+from vcl_companion.errors import VclError
+from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.vision_pose import Firmware
+
+_HEARTBEAT_S = 5.0
+_STREAM_S = 2.5
+_LEAST_ATTITUDE_SHARE = 0.5
+_ROUND_TRIP_S = 0.05
+_GRADE_OF: dict[str, Grade] = {
+    "dangerous": "failure",
+    "prevents": "failure",
+    "warns": "warning",
+}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All that was looked at, and the parameters that could be mended."""
+
+    checks: tuple[Check, ...]
+    wrong: tuple[Finding, ...] = ()
+
+    @property
+    def is_good(self) -> bool:
+        """Whether nothing failed."""
+        return all(check.grade != "failure" for check in self.checks)
+
+
+async def check_all(config: Config) -> Outcome:
+    """Look at everything; what cannot be looked at is a failure of its own."""
+    clock = SystemClock()
+    checks = [*of_files(config), of_wall_clock()]
+    checks.append(await of_camera(config, clock))
+    link = AutopilotLink(config.autopilot, config.system_id, clock)
+    running = asyncio.ensure_future(link.run())
+    try:
+        more, wrong = await _of_autopilot(config, link)
+    finally:
+        running.cancel()
+        with suppress(asyncio.CancelledError, VclError):
+            await running
+    return Outcome((*checks, *more), tuple(wrong))
+
+
+async def set_parameters(
+    config: Config, values: Mapping[str, float]
+) -> tuple[dict[str, float], list[str]]:
+    """Set parameters of the autopilot.
+
+    Returns:
+        what each was before, and the names of those that did not take their value.
+    """
+    link = AutopilotLink(config.autopilot, config.system_id, SystemClock())
+    running = asyncio.ensure_future(link.run())
+    before: dict[str, float] = {}
+    failed = []
+    try:
+        await _heard_of(link)
+        for name, value in values.items():
+            was = await link.parameter(name)
+            now = None if was is None else await link.set_parameter(name, value)
+            if was is None or now is None or abs(now - value) > 1e-5 * max(1.0, abs(value)):
+                failed.append(name)
+            else:
+                before[name] = was
+    finally:
+        running.cancel()
+        with suppress(asyncio.CancelledError, VclError):
+            await running
+    return before, failed
+
+
+def outcome_json(outcome: Outcome) -> str:
+    """Return it for programs."""
+    return json.dumps(
+        {
+            "good": outcome.is_good,
+            "checks": [asdict(check) for check in outcome.checks],
+            "parameters": [asdict(finding) for finding in outcome.wrong],
+        },
+        indent=1,
+    )
+
+
+async def _heard_of(link: AutopilotLink) -> bool:
+    """Wait for the autopilot's first heartbeat; whether it came."""
+    deadline_s = time.monotonic() + _HEARTBEAT_S
+    while link.firmware is Firmware.OTHER and time.monotonic() < deadline_s:
+        await asyncio.sleep(0.1)
+    return link.firmware is not Firmware.OTHER
+
+
+async def _of_autopilot(config: Config, link: AutopilotLink) -> tuple[list[Check], list[Finding]]:
+    if not await _heard_of(link):
+        advice = f"is it on, and autopilot.link right ({config.autopilot.link})? its system_id?"
+        what = f"no heartbeat of system {config.system_id} in {_HEARTBEAT_S:.0f} s"
+        return [Check("autopilot", "failure", what, advice)], []
+    checks = [Check("autopilot", "ok", f"{link.firmware.value}, system {config.system_id}")]
+    await asyncio.sleep(_STREAM_S)
+    rate_hz, wanted_hz = link.attitude_rate_hz, config.autopilot.attitude_rate_hz
+    what = f"attitude comes at {rate_hz:.0f} of {wanted_hz:.0f} Hz"
+    if rate_hz < _LEAST_ATTITUDE_SHARE * wanted_hz:
+        checks.append(Check("link", "failure", what, "a faster baud rate, or fewer other streams"))
+    else:
+        checks.append(Check("link", "ok", what))
+    checks.append(_of_time(link))
+    rules = rules_for(link.firmware, sends_velocity=config.autopilot.message == "odometry")
+    values = {}
+    for name in dict.fromkeys(names_of(rules)):
+        value = await link.parameter(name)
+        if value is not None:
+            values[name] = value
+    wrong = findings(rules, values)
+    for found in wrong:
+        has = "is not there" if found.value is None else f"is {found.value:g}"
+        checks.append(
+            Check(
+                found.name,
+                _GRADE_OF[found.severity],
+                f"{has}: {found.why}",
+                f"set it to {found.should_be:g}",
+            )
+        )
+    if not wrong:
+        checks.append(Check("parameters", "ok", f"all {len(values)} that matter are right"))
+    return checks, wrong
+
+
+def _of_time(link: AutopilotLink) -> Check:
+    round_trip_s = link.round_trip_s
+    if round_trip_s is None:
+        advice = "TIMESYNC: attitudes are timed by arrival, and a PX4 does not fuse"
+        grade: Grade = "failure" if link.firmware is Firmware.PX4 else "warning"
+        return Check("time", grade, "questions for the time are not answered", advice)
+    what = f"answered in {round_trip_s * 1e3:.1f} ms"
+    if round_trip_s > _ROUND_TRIP_S:
+        return Check("time", "warning", what, "a slow link: instants are wrong by half of it")
+    return Check("time", "ok", what)

@@ -1,0 +1,40 @@
+"""What an autopilot's parameters were before ``vcl check --fix`` set them, in a file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from vcl_companion.errors import ConfigError
+
+
+def write_before(path: Path, before: Mapping[str, float]) -> None:
+    """Keep what parameters were before they were set, for ``--restore``.
+
+    What is kept already is what they were at first, and stays.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    try:
+        kept = read_before(path) if path.exists() else {}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps({**before, **kept}, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from error
+
+
+def read_before(path: Path) -> dict[str, float]:
+    """Return what parameters were.
+
+    Raises:
+        ConfigError: there is no such file, or it is something else.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        return {str(name): float(value) for name, value in values.items()}
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}: nothing to restore") from error
+    except (ValueError, AttributeError, TypeError) as error:
+        raise ConfigError(f"{path}: holds no parameters") from error

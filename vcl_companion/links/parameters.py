@@ -1,0 +1,85 @@
+"""An autopilot's parameters, one by one: the PARAM protocol's reading and setting.
+
+An ArduPilot sends every value as a float; a PX4 sends an integer's four bytes in its place
+(https://mavlink.io/en/services/parameter.html, "Parameter Encoding").
+"""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+from collections.abc import Callable
+from contextlib import suppress
+
+from vcl_companion.links.messages import ParameterValue
+from vcl_companion.links.vision_pose import Firmware
+
+_FLOAT, _INT32, _UINT32 = struct.Struct("<f"), struct.Struct("<i"), struct.Struct("<I")
+# MAV_PARAM_TYPE
+_TYPE_UINT32, _TYPE_INT32, _TYPE_REAL32 = 5, 6, 9
+_ANSWER_S = 0.5
+_N_ATTEMPTS = 4
+
+
+def value_of(message: ParameterValue, firmware: Firmware) -> float:
+    """Return a parameter's value as its firmware means its bytes."""
+    form = _FLOAT
+    if firmware is Firmware.PX4:
+        form = {_TYPE_INT32: _INT32, _TYPE_UINT32: _UINT32}.get(message.kind, _FLOAT)
+    return float(form.unpack(message.raw)[0])
+
+
+def raw_of(value: float, kind: int, firmware: Firmware) -> bytes:
+    """Return the four bytes of a value for a parameter of a type."""
+    if firmware is Firmware.PX4 and kind == _TYPE_INT32:
+        return _INT32.pack(round(value))
+    if firmware is Firmware.PX4 and kind == _TYPE_UINT32:
+        return _UINT32.pack(round(value))
+    return _FLOAT.pack(value)
+
+
+class Parameters:
+    """Asks for parameters and waits for the answers; one question of a name at a time.
+
+    Args:
+        read: sends the question for one.
+        write: sends a new value: name, its bytes, its type.
+    """
+
+    def __init__(
+        self, read: Callable[[str], None], write: Callable[[str, bytes, int], None]
+    ) -> None:
+        self._read = read
+        self._write = write
+        self._waiting: dict[str, asyncio.Future[ParameterValue]] = {}
+
+    def answered(self, message: ParameterValue) -> None:
+        """Take a PARAM_VALUE in, asked for or not."""
+        future = self._waiting.pop(message.name, None)
+        if future is not None and not future.done():
+            future.set_result(message)
+
+    async def value(self, name: str, firmware: Firmware) -> float | None:
+        """Return a parameter's value; None when the autopilot has none of the name."""
+        message = await self._asked(name, lambda: self._read(name))
+        return None if message is None else value_of(message, firmware)
+
+    async def set(self, name: str, value: float, firmware: Firmware) -> float | None:
+        """Set a parameter; return the value that it has then, None when it does not say."""
+        known = await self._asked(name, lambda: self._read(name))
+        if known is None:
+            return None
+        raw = raw_of(value, known.kind, firmware)
+        message = await self._asked(name, lambda: self._write(name, raw, known.kind))
+        return None if message is None else value_of(message, firmware)
+
+    async def _asked(self, name: str, ask: Callable[[], None]) -> ParameterValue | None:
+        for _ in range(_N_ATTEMPTS):
+            future: asyncio.Future[ParameterValue] = asyncio.get_running_loop().create_future()
+            self._waiting[name] = future
+            ask()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(_ANSWER_S):
+                    return await future
+        self._waiting.pop(name, None)
+        return None
