@@ -192,6 +192,54 @@ def check(config_path: Path, as_json: bool, fix: bool, yes: bool, restore: bool)
 
 
 @main.group()
+def ground() -> None:
+    """Ask drones for things from the ground, over their telemetry."""
+
+
+@ground.command("update-map")
+@click.option(
+    "--link",
+    "links",
+    multiple=True,
+    default=("udpin:0.0.0.0:14550",),
+    show_default=True,
+    metavar="LINK",
+    help="Where drones are heard, as autopilot.link: udpin:, udp:, tcp:, serial: (repeatable).",
+)
+@click.option(
+    "--drone",
+    "drones",
+    multiple=True,
+    type=click.IntRange(1, 255),
+    metavar="N",
+    help="System id (repeatable); otherwise all that are heard.",
+)
+@click.option(
+    "--within",
+    "within_s",
+    default=90.0,
+    show_default=True,
+    metavar="S",
+    type=click.FloatRange(1.0, 3600.0),
+    help="How long they have.",
+)
+def ground_update_map(links: tuple[str, ...], drones: tuple[int, ...], within_s: float) -> None:
+    """Have drones update their map now, and follow it to the end; Ctrl-C cancels it.
+
+    Exit status: 0 when all of them have a new map, 1 when not, 2 when nobody is heard.
+    """
+    import asyncio
+
+    from vcl_companion.ground.map_update import MapUpdate, Told
+
+    def tell(told: Told) -> None:
+        click.echo(f"drone {told.system_id}: {told.text}")
+
+    is_done = asyncio.run(MapUpdate(links, drones, within_s, tell).run())
+    click.get_current_context().exit(0 if is_done else 1)
+
+
+@main.group()
 def keys() -> None:
     """Make, install and look at the key that drones sign with."""
 

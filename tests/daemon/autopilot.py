@@ -37,6 +37,7 @@ class Autopilot(asyncio.DatagramProtocol):
         self._parts: list[bytes] = []
         self.texts: asyncio.Queue[str] = asyncio.Queue()
         self.states: asyncio.Queue[int] = asyncio.Queue()
+        self.answers: asyncio.Queue[tuple[int, int, int]] = asyncio.Queue()
         self.poses: asyncio.Queue[tuple[Any, ...]] = asyncio.Queue()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -55,8 +56,26 @@ class Autopilot(asyncio.DatagramProtocol):
                     self.states.put_nowait(int(seen.fields[4]))
                 case wire.STATUSTEXT:
                     self._take_text(*seen.fields)
+                case wire.COMMAND_ACK:
+                    command, result, progress, _, system, component = seen.fields
+                    assert (system, component) == (255, 190)
+                    self.answers.put_nowait((command, result, progress))
                 case wire.VISION_POSITION_ESTIMATE:
                     self.poses.put_nowait(seen.fields)
+
+    def forward(
+        self,
+        command: int,
+        parameter: float = 0.0,
+        *,
+        confirmation: int = 0,
+        target: int | None = None,
+        system: int = 255,
+    ) -> None:
+        """Hand on a ground station's command."""
+        to = self._system_id if target is None else target
+        fields = (parameter, *[0.0] * 6, command, to, 197, confirmation)
+        self._say(wire.packed(wire.COMMAND_LONG, *fields, system=system, component=190))
 
     def measure(self, at_ns: int, quaternion: Array) -> None:
         """Turn, and send that attitude as one of an instant of the companion's time."""

@@ -20,6 +20,7 @@ from tests.ports import free_ports
 from vcl_companion.cameras.source import Frame
 from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import ManualClock
+from vcl_companion.daemon.commands import Commands
 from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.exchange import Exchange, ExchangeOptions
@@ -109,6 +110,7 @@ class Drone:
             clock, self.exchange.clocks.answered, open_signing(peers),
         )  # fmt: skip
         self.exchange.attach(self._link)
+        Commands(self.autopilot_link, self.exchange, self.maps, self.estimator, self.log)
 
     async def run(self) -> None:
         async with asyncio.TaskGroup() as parts:

@@ -21,6 +21,7 @@ from vcl_companion.cameras.open import open_camera
 from vcl_companion.clock import Clock, ManualClock, SystemClock
 from vcl_companion.config import Config
 from vcl_companion.daemon import notify
+from vcl_companion.daemon.commands import Commands
 from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.exchange import Exchange, ExchangeOptions
@@ -220,6 +221,7 @@ async def _run(config: Config) -> int:
         disk,
     )
     exchange.attach(peers)
+    Commands(autopilot, exchange, maps, estimator, log)
     status_file = Path(config.log.status_file) if config.log.status_file else None
     reporter = StatusReporter(
         status_file, config.system_id, health, autopilot, estimator, maps, group, disk

@@ -448,14 +448,15 @@ class Companion:
         n_inliers: int = 0,
     ) -> NotLocalized | None:
         """Send the pose of a frame, at its own time; or say why it cannot be."""
-        if not self._tell(state, frame.captured_at_ns):
-            return NotLocalized("the pose's covariance is not finite", n_matched, n_inliers)
+        why_not = self._tell(state, frame.captured_at_ns)
+        if why_not is not None:
+            return NotLocalized(why_not, n_matched, n_inliers)
         self._sent_at_ns = max(self._sent_at_ns, frame.captured_at_ns)
         self._outcomes.sent(frame, source, by, n_matched, n_inliers)
         return None
 
-    def _tell(self, state: FilterState, at_ns: int) -> bool:
-        """Send the autopilot a state's pose in the frame that it knows; whether that can be."""
+    def _tell(self, state: FilterState, at_ns: int) -> str | None:
+        """Send the autopilot a state's pose in the frame that it knows, or say why not."""
         local_from_world = self._estimator.local_from_world
         turn = local_from_world.rotation
         return self._autopilot.send_pose(
@@ -478,7 +479,7 @@ class Companion:
         self._health.refused(why.reason)
         at_ns = frame.captured_at_ns
         state = self._estimator.coasted_at(at_ns) if at_ns > self._sent_at_ns else None
-        coasted = state is not None and self._tell(state, at_ns)
+        coasted = state is not None and self._tell(state, at_ns) is None
         if coasted:
             self._sent_at_ns = at_ns
         self._outcomes.refuse(frame, why, coasted=coasted)

@@ -96,6 +96,12 @@ class Estimator:
             return math.inf
         return float(np.sqrt(np.linalg.eigvalsh(state.pose_covariance()[:3, :3])[-1]))
 
+    def forget(self) -> None:
+        """Know nothing of where we are any more: the next frame is looked for everywhere."""
+        self._history.clear()
+        self._n_contradicted = 0
+        self._own_fix = None
+
     def own_fix_at(self, at_ns: int) -> FilterState | None:
         """Return what was believed at a frame that had a fix of its own; None at any other."""
         return self._history.own_fix_at(at_ns)

@@ -448,6 +448,15 @@ class Exchange:
         ]
         return tuple(self._hand(BlobKind.FRAME_ANSWER, to, blob) for to in (peer, *others))
 
+    def want_update(self, wanted: bool) -> None:
+        """Want the map updated, or not any more, because the ground does."""
+        self._own_state.is_asked_for_update = self._rounds.is_asked = wanted
+
+    @property
+    def update_progress(self) -> int:
+        """How far the update is that this drone makes, percent; 255 where it makes none."""
+        return self._rounds.progress
+
     def _send(self, message: Message, peer: int) -> None:
         """Have a message to a peer, or to all (0), go before all that is less urgent."""
         self._transfers.post(peer, message)

@@ -33,6 +33,8 @@ from vcl_companion.wire.messages import FrameRequest
 
 _log = logging.getLogger(__name__)
 
+# Percent of an update.
+_GATHERING, _BUILDING = 20, 60
 _LOOK_S = 0.1
 # A camera that delivers nothing new has nothing for a map either.
 _STALE_NS = 60 * 1_000_000_000
@@ -112,6 +114,10 @@ class MapRounds:
         self._gathering = Gathering(group, ask, clock, clocks, rng)
         self._trigger = UpdateTrigger(options.update, group)
         self._claimed_since_s: float | None = None
+        self.is_asked = False
+        """Whether the ground wants an update: whoever coordinates makes it at once."""
+        self.progress = 255
+        """How far the update is that is being made, percent; 255: none is."""
 
     def take(self, peer: int, frame: FrameAnswer) -> str | None:
         """Take a peer's frame; return why it is refused, if it is."""
@@ -132,12 +138,19 @@ class MapRounds:
             elif stored is None and self._is_first_due(began_at_s):
                 tried = frame
                 await self._first_map(frame)
-            elif stored is not None and self._trigger.is_due(self._now_s()):
+            elif stored is not None and self._is_due():
                 tried = frame
-                await self._next_revision(stored, frame)
+                try:
+                    await self._next_revision(stored, frame)
+                finally:
+                    self.progress, self.is_asked = 255, False
                 self._trigger.ended(self._now_s())
             else:
                 await asyncio.sleep(_LOOK_S)
+
+    def _is_due(self) -> bool:
+        asked = self.is_asked and self._group.is_coordinator and not self._group.lacking()
+        return asked or self._trigger.is_due(self._now_s())
 
     def _is_stale(self, frame: Frame) -> bool:
         return self._clock.now_ns() - frame.captured_at_ns > _STALE_NS
@@ -188,6 +201,7 @@ class MapRounds:
         update = self._options.update
         lost = self._trigger.lost(self._now_s())
         reason = f"wanted by drones {_listed(self._group.wanting_update)}"
+        reason += " and the ground" if self.is_asked else ""
         reason += f"; {_listed(lost)} lost" if lost else ""
         self._log.event("update", reason)
         _log.info("the map is updated, %s", reason)
@@ -207,10 +221,12 @@ class MapRounds:
         )
         self._passed.over()
         self._is_updating = True
+        self.progress = _GATHERING
         try:
             frames = await self._gathered(frame, wanted, lambda: self._is_past(stored))
         finally:
             self._is_updating = False
+        self.progress = _BUILDING
         await self._extend(stored, frames, lost, request_id)
 
     async def _extend(

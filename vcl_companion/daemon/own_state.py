@@ -53,6 +53,8 @@ class OwnState:
         self._send = send
         self._vote = OwnVote(options)
         self._wants_update = False
+        self.is_asked_for_update = False
+        """Whether the ground wants the map updated: then so do we."""
         self._has_joined = False  # somebody, who has not been told our state since
         self._told_at_s = float("-inf")
         self._told_lead = (0, 0)
@@ -104,6 +106,7 @@ class OwnState:
             Sight(seen.tracked, seen.covered, sigma_m, seen.novelty_deg),
             now_s,
         )
+        self._wants_update |= self.is_asked_for_update and stored is not None
         return self._wants_update != before
 
     def _interval_s(self) -> float:

@@ -6,6 +6,7 @@ import asyncio
 import enum
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -33,6 +34,7 @@ from vcl_companion.links.mavlink import (
 from vcl_companion.links.messages import (
     AttitudeSample,
     CommandAck,
+    CommandLong,
     EstimatorStatus,
     Heartbeat,
     LocalPosition,
@@ -85,6 +87,7 @@ class AutopilotOptions:
             ``auto``: whose the autopilot's HEARTBEAT says it is; ``plain``: as it is.
         message: in which poses are sent: ``vision_position_estimate``, or ``odometry``, which
             holds the velocity as well.
+        ground_systems: MAVLink systems whose commands are obeyed: ground stations.
         time_error_s: how well the autopilot knows the instant of a pose, 1 sigma: what it is
             told is uncertain by so much of the way.
     """
@@ -96,6 +99,7 @@ class AutopilotOptions:
     max_attitude_age_s: float = 0.1
     profile: Literal["auto", "ardupilot", "px4", "plain"] = "auto"
     message: Literal["vision_position_estimate", "odometry"] = "vision_position_estimate"
+    ground_systems: tuple[int, ...] = (255,)
     time_error_s: float = 0.005
 
     def __post_init__(self) -> None:
@@ -109,6 +113,8 @@ class AutopilotOptions:
             raise ConfigError(
                 f"max_attitude_age_s: must be above 0 up to 2, got {self.max_attitude_age_s}"
             )
+        if not all(1 <= system <= 255 for system in self.ground_systems):
+            raise ConfigError(f"ground_systems: must be in 1..255, got {self.ground_systems}")
         if not 0.0 <= self.time_error_s <= 0.1:
             raise ConfigError(f"time_error_s: must be in 0..0.1, got {self.time_error_s}")
 
@@ -131,6 +137,9 @@ class AutopilotLink:
         self._by_euler = AttitudeHistory(latency_ns, max_age_ns)
         self._streams = StreamRequests(options.attitude_rate_hz, self._request_stream)
         self._texts = Texts(self._codec, self._transport)
+        self.is_paused = False
+        """Whether poses are held back, as the ground has commanded."""
+        self.on_command: Callable[[CommandLong], None] | None = None
         self._parameters = Parameters(self._read_parameter, self._write_parameter)
         self._fusion = FusionMonitor()
         self._sync = TimesyncEstimator()
@@ -168,6 +177,14 @@ class AutopilotLink:
     def attitude_rate_hz(self) -> float:
         """How often ATTITUDE_QUATERNION came in the last seconds, Hz."""
         return self._by_quaternion.rate_hz
+
+    def answer(self, message: CommandLong, result: int, progress: int = 255) -> None:
+        """Say what became of a command, to who gave it: MAV_RESULT, and percent of its way."""
+        self._transport.write(
+            self._codec.command_ack(
+                message.command, result, progress, message.sender_system, message.sender_component
+            )
+        )
 
     async def parameter(self, name: str) -> float | None:
         """Return one of the autopilot's parameters; None when it has none of the name."""
@@ -215,17 +232,19 @@ class AutopilotLink:
             return None
         return self._history(at_ns, offset_ns).at(at_ns, offset_ns)
 
-    def send_pose(self, estimate: PoseEstimate) -> bool:
+    def send_pose(self, estimate: PoseEstimate) -> str | None:
         """Send where we were, as the autopilot's firmware wants to be told.
 
         Returns:
-            False when the covariance is not finite or has a negative variance:
-            nothing was sent, and it is counted.
+            None when it was sent; else why not: the ground has paused it, or the covariance is
+            not finite or has a negative variance, which is counted.
         """
+        if self.is_paused:
+            return "paused by the ground"
         covariance = covariance_for(self._firmware, estimate, self._options.time_error_s)
         if isinstance(covariance, str):
             self._tally.refuse(f"pose not sent: {covariance}")
-            return False
+            return f"the pose's covariance is not one: {covariance}"
         pose = estimate.local_from_body
         x_m, y_m, z_m = pose.translation.tolist()
         usec, reset_counter = estimate.at_ns // 1000, self._reset_counter(estimate.n_resets)
@@ -251,7 +270,7 @@ class AutopilotLink:
         self._transport.write(frame)
         sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0))
         self._fusion.sent(estimate.at_ns, pose.translation, sigma_m)
-        return True
+        return None
 
     def _reset_counter(self, n_resets: int) -> int:
         """Return a counter that is not the autopilot's own first one, nor our last run's.
@@ -295,7 +314,9 @@ class AutopilotLink:
         )
         accepted = False
         for message in decode(data):
-            if message.sender_system != self._system_id:
+            if isinstance(message, CommandLong):
+                self._take_command(message)
+            elif message.sender_system != self._system_id:
                 self._tally.refuse("another system")
             elif message.sender_component != COMPONENT_AUTOPILOT:
                 self._tally.refuse("another component")
@@ -332,6 +353,16 @@ class AutopilotLink:
                 for_us = target in (0, self._system_id) and command == SET_MESSAGE_INTERVAL
                 if for_us and result != RESULT_ACCEPTED:
                     _log.warning("the autopilot refuses to stream attitude (result %d)", result)
+
+    def _take_command(self, message: CommandLong) -> None:
+        """Hand a command on that is for us, from who may give it."""
+        is_for_us = message.target_system == self._system_id
+        if not is_for_us or message.target_component not in (0, COMPONENT_COMPANION):
+            self._tally.refuse("a command for somebody else")
+        elif message.sender_system not in (*self._options.ground_systems, self._system_id):
+            self._tally.refuse("a command of a stranger")
+        elif self.on_command is not None:
+            self.on_command(message)
 
     def _take_position(self, message: LocalPosition) -> None:
         offset_ns = self._offset_ns(self._clock.now_ns())

@@ -62,7 +62,9 @@ ATTITUDE_QUATERNION_ID = 31
 LOCAL_POSITION_ID = 32
 EKF_STATUS_REPORT_ID = 193
 ESTIMATOR_STATUS_ID = 230
-RESULT_ACCEPTED = 0
+RESULT_ACCEPTED, RESULT_TEMPORARILY_REJECTED, RESULT_DENIED, RESULT_UNSUPPORTED = 0, 1, 2, 3
+RESULT_FAILED, RESULT_IN_PROGRESS, RESULT_CANCELLED = 4, 5, 6
+UPDATE_MAP, RELOCALIZE, PAUSE_SENDING = 31010, 31013, 31014  # MAV_CMD_USER_1, 4, 5
 FRAME_LOCAL_NED, FRAME_LOCAL_FRD = 1, 20
 
 _MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
@@ -241,6 +243,14 @@ class Codec:
             )
         )
 
+    def ground_heartbeat(self) -> bytes:
+        """Return a ground station's HEARTBEAT."""
+        return self._pack(
+            dialect.MAVLink_heartbeat_message(
+                dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3
+            )
+        )
+
     def timesync(self, tc1_ns: int, ts1_ns: int, target_system: int = 0) -> bytes:
         """Return a TIMESYNC, a question when ``tc1_ns`` is 0; to another companion, or to any."""
         if target_system:
@@ -275,6 +285,30 @@ class Codec:
         return self._pack(
             dialect.MAVLink_command_long_message(
                 target_system, COMPONENT_AUTOPILOT, SET_MESSAGE_INTERVAL, 0, *parameters
+            )
+        )
+
+    def command(
+        self,
+        target_system: int,
+        command: int,
+        parameters: tuple[float, float, float, float, float, float, float],
+        confirmation: int = 0,
+    ) -> bytes:
+        """Return a COMMAND_LONG to another companion."""
+        return self._pack(
+            dialect.MAVLink_command_long_message(
+                target_system, COMPONENT_COMPANION, command, confirmation, *parameters
+            )
+        )
+
+    def command_ack(
+        self, command: int, result: int, progress: int, target_system: int, target_component: int
+    ) -> bytes:
+        """Return the COMMAND_ACK of a command, to who gave it."""
+        return self._pack(
+            dialect.MAVLink_command_ack_message(
+                command, result, progress, 0, target_system, target_component
             )
         )
 
@@ -458,7 +492,7 @@ def _command_long(m: Any, sender: _Sender) -> Message | str:
 
 
 def _command_ack(m: Any, sender: _Sender) -> Message | str:
-    return CommandAck(*sender, m.command, m.result, m.target_system, m.target_component)
+    return CommandAck(*sender, m.command, m.result, m.target_system, m.target_component, m.progress)
 
 
 # What becomes of each message: a value, or why it is refused.

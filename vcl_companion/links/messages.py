@@ -107,12 +107,13 @@ class CommandLong(Message):
 
 @dataclass(frozen=True)
 class CommandAck(Message):
-    """What became of a command: ``result`` MAV_RESULT."""
+    """What became of a command: ``result`` MAV_RESULT, ``progress`` in percent, 255: unknown."""
 
     command: int
     result: int
     target_system: int
     target_component: int
+    progress: int = 255
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,141 @@
+"""The ground's order for a map update, against companions made by hand."""
+
+import asyncio
+from collections.abc import Sequence
+
+import pytest
+from click.testing import CliRunner
+
+from tests.links import wire
+from tests.links.running import Udp, running, udp
+from tests.ports import free_ports
+from vcl_companion.cli import main
+from vcl_companion.errors import DeviceError
+from vcl_companion.ground.map_update import MapUpdate, Told
+
+UPDATE_MAP = 31010
+ACCEPTED, BUSY, DENIED, UNSUPPORTED, FAILED, IN_PROGRESS, CANCELLED = range(7)
+
+
+class Companion:
+    """A drone's component 197, heard over a link: it answers an order as it is told to.
+
+    Args:
+        side: its socket.
+        system_id: whose.
+        answers: result and progress of each, a twentieth of a second apart.
+        loses: so many orders do not arrive.
+    """
+
+    def __init__(
+        self, side: Udp, system_id: int, answers: Sequence[tuple[int, int]], loses: int = 0
+    ) -> None:
+        self._side = side
+        self._system_id = system_id
+        self._answers = answers
+        self._loses = loses
+        self.orders: list[tuple[float, int]] = []
+
+    async def run(self, ground: tuple[str, int]) -> None:
+        while True:
+            self._say(wire.heartbeat(self._system_id, 197), ground)
+            try:
+                async with asyncio.timeout(0.1):
+                    data, _ = await self._side.got.get()
+            except TimeoutError:
+                continue
+            for seen in wire.read(data):
+                if seen.message_id == wire.COMMAND_LONG and seen.fields[8] == self._system_id:
+                    assert (seen.system, seen.component) == (255, 190)
+                    assert (seen.fields[7], seen.fields[9]) == (UPDATE_MAP, 197)
+                    await self._obey(seen.fields[0], seen.fields[10], ground)
+
+    async def _obey(self, first: float, confirmation: int, ground: tuple[str, int]) -> None:
+        self.orders.append((first, confirmation))
+        if len(self.orders) <= self._loses:
+            return
+        answers = self._answers if first == 0.0 else [(CANCELLED, 255)]
+        for result, progress in answers:
+            answer = wire.packed(
+                wire.COMMAND_ACK, UPDATE_MAP, result, progress, 0, 255, 190,
+                system=self._system_id, component=197,
+            )  # fmt: skip
+            self._say(answer, ground)
+            await asyncio.sleep(0.05)
+
+    def _say(self, data: bytes, ground: tuple[str, int]) -> None:
+        self._side.transport.sendto(data, ground)
+
+
+async def ordered(
+    *companions: tuple[int, Sequence[tuple[int, int]], int],
+    drones: Sequence[int] = (),
+    within_s: float = 8.0,
+) -> tuple[bool, list[Told], list[Companion]]:
+    """Have companions, each over a link of its own, update their map; return what came of it."""
+    told: list[Told] = []
+    ports = free_ports(len(companions))
+    links = [f"udpin:127.0.0.1:{port}" for port in ports]
+    order = MapUpdate(links, drones, within_s, told.append)
+    async with udp() as one, udp() as two:
+        sides = (one, two)[: len(companions)]
+        made = [Companion(side, *parts) for side, parts in zip(sides, companions, strict=True)]
+        grounds = [("127.0.0.1", port) for port in ports]
+        async with running(*(c.run(at) for c, at in zip(made, grounds, strict=True))):
+            return await order.run(), told, made
+
+
+def texts(told: list[Told], drone: int) -> list[str]:
+    return [one.text for one in told if one.system_id == drone]
+
+
+def test_all_that_are_heard_are_asked_and_followed_to_the_end() -> None:
+    going = [(IN_PROGRESS, 0), (IN_PROGRESS, 20), (IN_PROGRESS, 20), (ACCEPTED, 100)]
+    is_done, told, _ = asyncio.run(ordered((1, going, 0), (2, [(ACCEPTED, 100)], 0)))
+    assert is_done
+    assert texts(told, 1) == ["is at it, 0 %", "is at it, 20 %", "has a new map"]
+    assert texts(told, 2) == ["has a new map"]
+    assert [one.is_good for one in told if one.is_over] == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("result", "text"),
+    [
+        (BUSY, "has no map yet"),
+        (DENIED, "refuses"),
+        (UNSUPPORTED, "does not know the command"),
+        (FAILED, "no update came of it"),
+    ],
+)
+def test_what_came_of_it_is_said(result: int, text: str) -> None:
+    is_done, told, _ = asyncio.run(ordered((1, [(IN_PROGRESS, 255), (result, 255)], 0)))
+    assert not is_done
+    assert texts(told, 1) == ["is at it", text]
+
+
+def test_an_order_that_is_lost_is_repeated_as_the_same_one() -> None:
+    is_done, _, (one,) = asyncio.run(ordered((1, [(ACCEPTED, 100)], 2), drones=[1]))
+    assert is_done
+    assert one.orders == [(0.0, 0), (0.0, 1), (0.0, 2)]
+
+
+def test_who_is_not_done_in_time_is_told_to_stop() -> None:
+    is_done, told, (one,) = asyncio.run(
+        ordered((1, [(IN_PROGRESS, 60)], 0), drones=[1], within_s=1.0)
+    )
+    assert not is_done
+    assert texts(told, 1)[-1] == "is not done in time; cancelled"
+    assert one.orders[0] == (0.0, 0)
+
+
+def test_who_is_not_heard_is_named() -> None:
+    with pytest.raises(DeviceError, match="companion of 9 is not heard"):
+        asyncio.run(ordered((1, [(ACCEPTED, 100)], 0), drones=[1, 9]))
+
+
+def test_nobody_there_is_one_line_and_status_2() -> None:
+    (port,) = free_ports(1)
+    result = CliRunner().invoke(main, ["ground", "update-map", "--link", f"udpin:127.0.0.1:{port}"])
+    assert result.exit_code == 2
+    assert "the companion of any drone is not heard" in result.output
+    assert "Traceback" not in result.output
