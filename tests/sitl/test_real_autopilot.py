@@ -1,0 +1,172 @@
+"""Our link to a real ArduCopter that feels a true motion: what it fuses, loses and follows.
+
+Runs when ``VCL_ARDUPILOT`` names a binary built for simulation.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Callable, Coroutine
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sitl.autopilots.ardupilot import PARAMETERS, ArduPilot, ArduPilotOptions
+from sitl.autopilots.motion import RecordedMotion
+from sitl.autopilots.steered import open_udp
+from vcl_companion.clock import ManualClock
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.links.autopilot import AutopilotLink, AutopilotOptions
+from vcl_companion.links.fusion import FusionState
+from vcl_companion.links.vision_pose import PoseEstimate
+
+_BINARY = os.environ.get("VCL_ARDUPILOT", "")
+pytestmark = pytest.mark.skipif(not _BINARY, reason="VCL_ARDUPILOT names no arducopter")
+
+SYSTEM = 2
+START_NS = 1_000_000_000_000
+BOOTED_BEFORE_NS = 40_000_000_000
+STEP_NS = 20_000_000
+PERIOD_NS = 100_000_000
+SIGMA_M = 0.02
+BEGINS_AT = np.array([2.0, 2.7, -1.5])
+
+
+def motion() -> RecordedMotion:
+    """A minute and a half of wide turns at up to 1.6 m/s, away from the origin."""
+    t = np.arange(0.0, 90.0, 0.1)
+    positions = BEGINS_AT + np.c_[4.0 * np.sin(0.4 * t), 2.0 * np.cos(0.4 * t) - 2.0, -0.1 * t]
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))
+    return RecordedMotion(START_NS + np.round(t * 1e9).astype(np.int64), positions, level)
+
+
+class Flight:
+    """The firmware, our link to it, and a drone that knows where it is."""
+
+    def __init__(self, autopilot: ArduPilot, port: int, true: RecordedMotion) -> None:
+        self.clock = ManualClock(START_NS)
+        options = AutopilotOptions(link=f"udp:127.0.0.1:{port}")
+        self.link = AutopilotLink(options, SYSTEM, self.clock)
+        self.off = np.zeros(3)
+        self.n_resets = 0
+        self.states: list[FusionState] = []
+        self._autopilot = autopilot
+        self._true = true
+
+    async def fly(self, seconds: float, *, sends: bool = True) -> None:
+        """Go on for so long, told where it is ten times a second."""
+        until_ns = self.clock.now_ns() + round(seconds * 1e9)
+        self.states = []
+        while self.clock.now_ns() < until_ns:
+            now_ns = self.clock.now_ns() + STEP_NS
+            self._autopilot.advance_to(now_ns)
+            self.clock.advance_to(now_ns)
+            if sends and now_ns % PERIOD_NS == 0:
+                self._send(now_ns)
+            await asyncio.sleep(0.002)
+            state = self.link.fusion().state
+            if not self.states or self.states[-1] is not state:
+                self.states.append(state)
+
+    def _send(self, now_ns: int) -> None:
+        there = self._true.at(np.array([now_ns], dtype=np.int64))
+        told = Pose(np.eye(3), there.positions_m[0] + self.off)
+        covariance = np.diag([SIGMA_M**2] * 3 + [1e-4] * 3)
+        estimate = PoseEstimate(
+            told, covariance, there.velocities_m_s[0], 0.01 * np.eye(3), now_ns, self.n_resets
+        )
+        assert self.link.send_pose(estimate) is None
+
+    def apart_m(self, fused: Path) -> Array:
+        """Return (T,) how far it was from where it was told to be, in the last second."""
+        rows = [line.split(",") for line in fused.read_text().splitlines()[-60:]]
+        times = np.array([int(row[0]) for row in rows])
+        believed = np.array([[float(value) for value in row[1:]] for row in rows])
+        lately = times > self.clock.now_ns() - 1_000_000_000
+        told = self._true.at(times[lately]).positions_m + self.off
+        return np.asarray(np.linalg.norm(believed[lately] - told, axis=1))
+
+
+def flown(tmp_path: Path, scenario: Callable[[Flight, Path], Coroutine[None, None, None]]) -> None:
+    true = motion()
+    out = tmp_path / "mav1"
+    out.mkdir()
+    options = ArduPilotOptions(
+        Path(_BINARY), SYSTEM, START_NS - BOOTED_BEFORE_NS, true, PARAMETERS, 0.0, out,
+        tmp_path / "firmware",
+    )  # fmt: skip
+    with ExitStack() as stack:
+        udp = stack.enter_context(open_udp())
+        files = [
+            stack.enter_context((out / name).open("w", buffering=1))
+            for name in ("attitude.csv", "fused.csv", "received.jsonl", "said.csv")
+        ]
+        autopilot = ArduPilot(options, udp, stack, *files)
+        autopilot.advance_to(START_NS)
+
+        async def run() -> None:
+            flight = Flight(autopilot, udp.getsockname()[1], true)
+            async with asyncio.timeout(120.0):
+                link = asyncio.ensure_future(flight.link.run())
+                try:
+                    await scenario(flight, out / "fused.csv")
+                finally:
+                    link.cancel()
+
+        asyncio.run(run())
+
+
+def test_poses_are_fused_within_two_seconds_wherever_they_begin(tmp_path: Path) -> None:
+    async def scenario(flight: Flight, fused: Path) -> None:
+        await flight.fly(2.0)
+        assert flight.link.fusion().state is FusionState.FUSED, flight.link.fusion()
+        await flight.fly(8.0)
+        assert flight.states == [FusionState.FUSED]
+        assert flight.apart_m(fused).max() < 0.1
+        await flight.fly(20.0)
+        assert flight.link.ahead_s is not None
+        assert abs(flight.link.ahead_s) < 0.03
+
+    flown(tmp_path, scenario)
+
+
+def test_a_jump_that_is_told_is_followed_within_a_third_of_a_second(tmp_path: Path) -> None:
+    async def scenario(flight: Flight, fused: Path) -> None:
+        await flight.fly(10.0)
+        flight.off, flight.n_resets = np.array([3.0, -4.0, 0.0]), 1
+        await flight.fly(0.3)
+        assert flight.apart_m(fused)[-1] < 0.2
+        await flight.fly(3.0)
+        assert flight.states == [FusionState.FUSED]
+        assert flight.apart_m(fused).max() < 0.15
+
+    flown(tmp_path, scenario)
+
+
+def test_a_second_without_vision_is_harmless(tmp_path: Path) -> None:
+    async def scenario(flight: Flight, fused: Path) -> None:
+        await flight.fly(10.0)
+        await flight.fly(1.0, sends=False)
+        assert flight.apart_m(fused).max() < 0.3
+        await flight.fly(5.0)
+        assert flight.states == [FusionState.FUSED]
+        assert flight.apart_m(fused).max() < 0.1
+
+    flown(tmp_path, scenario)
+
+
+def test_vision_that_returns_after_half_a_minute_is_fused_again(tmp_path: Path) -> None:
+    async def scenario(flight: Flight, fused: Path) -> None:
+        await flight.fly(10.0)
+        await flight.fly(25.0, sends=False)
+        lost = flight.states[-1]
+        assert lost is FusionState.LOST
+        await flight.fly(15.0)
+        assert flight.states[-1] is FusionState.FUSED
+        assert flight.apart_m(fused).max() < 0.15
+
+    flown(tmp_path, scenario)
