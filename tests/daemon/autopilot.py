@@ -107,7 +107,8 @@ async def autopilot_and_link(
     )
     try:
         port = transport.get_extra_info("sockname")[1]
-        options = AutopilotOptions(link=f"udp:127.0.0.1:{port}")
+        # Frames that wait for a search are answered in their order, however late.
+        options = AutopilotOptions(link=f"udp:127.0.0.1:{port}", max_pose_age_s=10.0)
         yield autopilot, AutopilotLink(options, system_id, clock)
     finally:
         transport.close()

@@ -249,7 +249,7 @@ def test_a_pose_goes_out_with_its_own_time_and_covariance() -> None:
     async def scenario() -> wire.Seen:
         async with linked(ManualClock(NOW_NS)) as (link, autopilot):
             await autopilot.next_of(wire.HEARTBEAT)
-            assert link.send_pose(at_rest(pose, covariance, NOW_NS - 12_345_678, 258))
+            assert link.send_pose(at_rest(pose, covariance, NOW_NS - 12_345_678, 258)) is None
             return await autopilot.next_of(wire.VISION_POSITION_ESTIMATE)
 
     seen = asyncio.run(scenario())
@@ -273,8 +273,8 @@ def test_a_pose_that_would_harm_is_not_sent(bad: float) -> None:
     async def scenario() -> None:
         async with linked(ManualClock(NOW_NS)) as (link, autopilot):
             await autopilot.next_of(wire.HEARTBEAT)
-            assert not link.send_pose(at_rest(pose, covariance))
-            assert link.send_pose(at_rest(pose, np.eye(6)))
+            assert link.send_pose(at_rest(pose, covariance)) is not None
+            assert link.send_pose(at_rest(pose, np.eye(6))) is None
             assert (await autopilot.next_of(wire.VISION_POSITION_ESTIMATE)).fields[28] > 0
             (reason,) = [r for r in link.counters.refused if r.startswith("pose not sent")]
             assert link.counters.refused[reason] == 1
@@ -288,7 +288,7 @@ def test_rounding_below_zero_is_sent_as_zero() -> None:
     async def scenario() -> None:
         async with linked(ManualClock(NOW_NS)) as (link, autopilot):
             await autopilot.next_of(wire.HEARTBEAT)
-            assert link.send_pose(at_rest(Pose.identity(), covariance))
+            assert link.send_pose(at_rest(Pose.identity(), covariance)) is None
             seen = await autopilot.next_of(wire.VISION_POSITION_ESTIMATE)
             diagonal = [seen.fields[7 + k] for k in (0, 6, 11, 15, 18, 20)]
             assert diagonal == [1, 1, 0, 1, 1, 1]
@@ -346,3 +346,27 @@ def test_a_stalled_service_has_no_heartbeat() -> None:
 def test_wrong_options_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
         AutopilotOptions(**options)  # type: ignore[arg-type]
+
+
+def test_what_is_too_old_is_not_sent_and_what_is_late_is_told_vaguely() -> None:
+    pose, _ = some_pose()
+    speed = np.array([2.0, 0.0, 0.0])
+
+    def aged(age_s: float) -> PoseEstimate:
+        at_ns = NOW_NS - round(age_s * 1e9)
+        return PoseEstimate(pose, 1e-4 * np.eye(6), speed, np.eye(3), at_ns, 0)
+
+    async def scenario() -> None:
+        async with linked(ManualClock(NOW_NS)) as (link, autopilot):
+            await autopilot.next_of(wire.HEARTBEAT)
+            assert link.send_pose(aged(2.1)) == "its pose was 2.1 s old"
+            assert link.counters.refused["pose not sent: too old"] == 1
+            sigmas = []
+            for age_s in (0.0, 0.2, 0.7):
+                assert link.send_pose(aged(age_s)) is None
+                seen = await autopilot.next_of(wire.VISION_POSITION_ESTIMATE)
+                sigmas.append(math.sqrt(seen.fields[7]))
+            assert sigmas[0] == sigmas[1] < 0.02
+            assert math.isclose(sigmas[2], math.hypot(0.01, 2.0 * 0.5), rel_tol=1e-3)
+
+    asyncio.run(scenario())

@@ -48,7 +48,7 @@ def test_frames_made_by_hand_are_understood() -> None:
     expected = CommandLong(255, 1, 9, 197, 31010, 2, (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0))
     assert decoded(command) == expected
     ack = wire.packed(wire.COMMAND_ACK, 511, 4, 0, 0, 9, 197)
-    assert decoded(ack) == CommandAck(1, 1, 511, 4, 9, 197)
+    assert decoded(ack) == CommandAck(1, 1, 511, 4, 9, 197, 0)
 
 
 def test_attitudes_become_rotations() -> None:

@@ -31,7 +31,7 @@ from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.scheduling import run_before_others
-from vcl_companion.daemon.status_reporter import StatusReporter
+from vcl_companion.daemon.status_writer import StatusWriter
 from vcl_companion.daemon.usage import (
     cpu_s,
     forget_peak,
@@ -222,10 +222,13 @@ async def _run(config: Config) -> int:
     )
     exchange.attach(peers)
     Commands(autopilot, exchange, maps, estimator, log)
-    status_file = Path(config.log.status_file) if config.log.status_file else None
-    reporter = StatusReporter(
-        status_file, config.system_id, health, autopilot, estimator, maps, group, disk
-    )
+    watching = [health.run()]
+    if config.log.status_file:
+        status = StatusWriter(
+            Path(config.log.status_file),
+            *(config.system_id, health, autopilot, estimator, maps, group, disk),
+        )
+        watching.append(status.run())
     began_at_s, began_cpu_s = time.monotonic(), cpu_s()
     try:
         await _until_ended(
@@ -234,8 +237,7 @@ async def _run(config: Config) -> int:
             peers.run(),
             exchange.run(),
             companion.run(),
-            health.run(),
-            reporter.run(),
+            *watching,
             ends_all=companion.read_camera(),
         )
     finally:

@@ -58,6 +58,8 @@ _SYNC_FAST_S, _SYNC_SLOW_S = 0.1, 1.0
 _SYNC_ENOUGH = 8
 # After this many unanswered questions (1 s) the autopilot does without TIMESYNC.
 _SYNC_GIVEN_UP = 10
+# How far back estimators fuse: EKF2_DELAY_MAX; VISO_DELAY_MS goes up to 0.25.
+_REMEMBERS_S = 0.2
 # 0 is what an autopilot that has heard of none takes for known.
 _RESETS = 255
 _FIRMWARE = {"ardupilot": Firmware.ARDUPILOT, "px4": Firmware.PX4}
@@ -88,6 +90,7 @@ class AutopilotOptions:
         message: in which poses are sent: ``vision_position_estimate``, or ``odometry``, which
             holds the velocity as well.
         ground_systems: MAVLink systems whose commands are obeyed: ground stations.
+        max_pose_age_s: a pose of a frame older than this is not sent.
         time_error_s: how well the autopilot knows the instant of a pose, 1 sigma: what it is
             told is uncertain by so much of the way.
     """
@@ -100,6 +103,7 @@ class AutopilotOptions:
     profile: Literal["auto", "ardupilot", "px4", "plain"] = "auto"
     message: Literal["vision_position_estimate", "odometry"] = "vision_position_estimate"
     ground_systems: tuple[int, ...] = (255,)
+    max_pose_age_s: float = 2.0
     time_error_s: float = 0.005
 
     def __post_init__(self) -> None:
@@ -115,6 +119,8 @@ class AutopilotOptions:
             )
         if not all(1 <= system <= 255 for system in self.ground_systems):
             raise ConfigError(f"ground_systems: must be in 1..255, got {self.ground_systems}")
+        if not 0.05 <= self.max_pose_age_s <= 10.0:
+            raise ConfigError(f"max_pose_age_s: must be in 0.05..10, got {self.max_pose_age_s}")
         if not 0.0 <= self.time_error_s <= 0.1:
             raise ConfigError(f"time_error_s: must be in 0..0.1, got {self.time_error_s}")
 
@@ -236,12 +242,18 @@ class AutopilotLink:
         """Send where we were, as the autopilot's firmware wants to be told.
 
         Returns:
-            None when it was sent; else why not: the ground has paused it, or the covariance is
-            not finite or has a negative variance, which is counted.
+            None when it was sent; else why not: the ground has paused it, it is too old, or the
+            covariance is not finite or has a negative variance.
         """
         if self.is_paused:
             return "paused by the ground"
-        covariance = covariance_for(self._firmware, estimate, self._options.time_error_s)
+        age_s = (self._clock.now_ns() - estimate.at_ns) * 1e-9
+        if age_s > self._options.max_pose_age_s:
+            self._tally.refuse("pose not sent: too old")
+            return f"its pose was {age_s:.1f} s old"
+        # It takes what is older than it remembers for the oldest that it does.
+        time_error_s = math.hypot(self._options.time_error_s, max(0.0, age_s - _REMEMBERS_S))
+        covariance = covariance_for(self._firmware, estimate, time_error_s)
         if isinstance(covariance, str):
             self._tally.refuse(f"pose not sent: {covariance}")
             return f"the pose's covariance is not one: {covariance}"

@@ -2,9 +2,9 @@
 
 * ArduPilot (GCS_Common.cpp, ``handle_common_vision_position_estimate_data``) makes one number of
   three variances, ``posErr = sqrt(c0 + c6 + c11)``, and takes it for the standard deviation of
-  each axis (AP_NavEKF3_PosVelFusion.cpp), and ``angErr = sqrt(c15 + c18 + c20)`` for that of the
-  heading. True variances would tell it of up to sqrt(3) times more than there is: each block is
-  scaled, so that it reads the position's worst direction, and the heading.
+  each axis (AP_NavEKF3_PosVelFusion.cpp). True variances would tell it of up to sqrt(3) times
+  more than there is: they are scaled, so that it reads the position's worst direction. The
+  attitude's, ``angErr = sqrt(c15 + c18 + c20)``, it takes for at least 5 degrees.
 * PX4 (mavlink_receiver.cpp, ``handle_message_vision_position_estimate``) takes six variances for
   what they are.
 
@@ -100,14 +100,11 @@ def covariance_for(firmware: Firmware, estimate: PoseEstimate, time_error_s: flo
 
 
 def _as_ardupilot_reads(covariance: Array) -> Array:
-    """Scale position and attitude so that the sums of their variances are one axis's variance."""
-    position, attitude = covariance[:3, :3], covariance[3:, 3:]
+    """Scale the position so that the sum of its variances is that of the worst direction."""
+    position = covariance[:3, :3]
+    total = float(np.trace(position))
+    if total <= 0.0:
+        return covariance
     worst = max(float(np.linalg.eigvalsh(position)[-1]), 0.0)
-    heading = float(attitude[2, 2])
-    scale = np.repeat([_share(worst, position), _share(heading, attitude)], 3)
-    return np.asarray(covariance * np.sqrt(np.outer(scale, scale)))
-
-
-def _share(variance: float, block: Array) -> float:
-    total = float(np.trace(block))
-    return variance / total if total > 0.0 else 1.0
+    scale = np.repeat([np.sqrt(worst / total), 1.0], 3)
+    return np.asarray(covariance * np.outer(scale, scale))

@@ -26,11 +26,11 @@ _log = logging.getLogger(__name__)
 _EVERY_S = 1.0
 
 
-class StatusReporter:
+class StatusWriter:
     """Gathers what is to be said; everything but the writing happens in the loop's thread.
 
     Args:
-        path: the file; None writes none.
+        path: the file.
         system_id: this drone.
         health: how the service is.
         autopilot: what becomes of our poses.
@@ -42,7 +42,7 @@ class StatusReporter:
 
     def __init__(
         self,
-        path: Path | None,
+        path: Path,
         system_id: int,
         health: Health,
         autopilot: AutopilotLink,
@@ -62,8 +62,6 @@ class StatusReporter:
 
     async def run(self) -> None:
         """Write until cancelled; a disk that cannot be written to is told of once."""
-        if self._path is None:
-            return
         loop = asyncio.get_running_loop()
         is_told = False
         while True:
