@@ -15,8 +15,8 @@ from functools import lru_cache
 
 from vcl_companion.errors import WireError
 from vcl_companion.links.counters import LinkTally
-from vcl_companion.links.mavlink import COMPONENT_COMPANION, Codec
-from vcl_companion.links.messages import Tunnel
+from vcl_companion.links.mavlink import Codec
+from vcl_companion.links.messages import COMPONENT_COMPANION, Tunnel
 from vcl_companion.wire.chunks import Chunk, decode_descriptor
 from vcl_companion.wire.header import PayloadKind, decode_header
 from vcl_companion.wire.tunnel import decode_payload, is_ours

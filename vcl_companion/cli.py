@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -14,6 +15,8 @@ from vcl_companion.errors import ConfigError, VclError
 
 if TYPE_CHECKING:
     from vcl_companion.config import LogOptions
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 # sd-daemon(3): journald reads the severity from the start of a line on standard error.
 _JOURNAL_PRIORITIES = {
@@ -48,6 +51,18 @@ class _JournalFormatter(logging.Formatter):
         return "\n".join(prefix + line for line in super().format(record).splitlines())
 
 
+def _config_option(help_text: str) -> Callable[[_Function], _Function]:
+    """Return the option that names a daemon's configuration."""
+    return click.option(
+        "--config",
+        "config_path",
+        required=True,
+        metavar="FILE",
+        type=click.Path(path_type=Path),
+        help=help_text,
+    )
+
+
 def set_up_logging(options: LogOptions) -> None:
     """Send messages from ``options.level`` up to standard error, in journald's form under it."""
     # The compiler tells of every instruction.
@@ -67,14 +82,7 @@ def main() -> None:
 
 
 @main.command()
-@click.option(
-    "--config",
-    "config_path",
-    required=True,
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="The daemon's configuration (systemd/vcl-companion.toml documents every setting).",
-)
+@_config_option("The daemon's configuration (systemd/vcl-companion.toml documents every setting).")
 def run(config_path: Path) -> None:
     """Run the daemon of one drone until SIGTERM or Ctrl-C.
 
@@ -103,14 +111,7 @@ def run(config_path: Path) -> None:
 
 
 @main.command()
-@click.option(
-    "--config",
-    "config_path",
-    required=True,
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="The configuration of the daemon that runs.",
-)
+@_config_option("The configuration of the daemon that runs.")
 @click.option("--json", "as_json", is_flag=True, help="As its file has it.")
 def status(config_path: Path, as_json: bool) -> None:
     """Say how the running daemon is, and whether the autopilot uses its poses.
@@ -133,14 +134,7 @@ def status(config_path: Path, as_json: bool) -> None:
 
 
 @main.command()
-@click.option(
-    "--config",
-    "config_path",
-    required=True,
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="The configuration of the daemon, which must not run meanwhile.",
-)
+@_config_option("The configuration of the daemon, which must not run meanwhile.")
 @click.option("--json", "as_json", is_flag=True, help="For programs; changes nothing.")
 @click.option("--fix", is_flag=True, help="Set the autopilot's parameters that are wrong.")
 @click.option("--yes", is_flag=True, help="With --fix or --restore: do not ask.")

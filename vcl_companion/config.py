@@ -20,7 +20,7 @@ from typing import Any, Literal, TypeVar
 
 from vcl_companion.cameras.source import CameraOptions
 from vcl_companion.errors import ConfigError
-from vcl_companion.links.autopilot import AutopilotOptions
+from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.peers import PeerOptions
 from vcl_companion.localization.intra import LocalizationOptions
 from vcl_companion.localization.pipeline import Pipeline

@@ -12,7 +12,8 @@ import numpy as np
 from tests.links import wire
 from vcl_companion.clock import Clock
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.links.autopilot import AutopilotLink, AutopilotOptions
+from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.autopilot_options import AutopilotOptions
 
 _TEXT_BYTES = 50
 _LEVEL = np.array([1.0, 0.0, 0.0, 0.0])

@@ -14,7 +14,8 @@ from vcl_companion.clock import ManualClock
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.pose import Pose, euler_pose_covariance
 from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, quaternion_from_matrix
-from vcl_companion.links.autopilot import AutopilotLink, AutopilotOptions, ServiceState
+from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.autopilot_options import AutopilotOptions, ServiceState
 from vcl_companion.links.reconnect import Address
 from vcl_companion.links.texts import Severity
 from vcl_companion.links.vision_pose import PoseEstimate

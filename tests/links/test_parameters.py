@@ -8,7 +8,8 @@ import pytest
 from tests.links import wire
 from tests.links.running import Udp, running, udp
 from vcl_companion.clock import ManualClock
-from vcl_companion.links.autopilot import AutopilotLink, AutopilotOptions
+from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.messages import ParameterValue
 from vcl_companion.links.parameters import raw_of, value_of
 from vcl_companion.links.vision_pose import Firmware

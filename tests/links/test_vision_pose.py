@@ -14,7 +14,8 @@ from vcl_companion.clock import ManualClock
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.pose import Pose, euler_pose_covariance
 from vcl_companion.geometry.rotation import Array, exp_so3, matrix_from_quaternion
-from vcl_companion.links.autopilot import AutopilotLink, AutopilotOptions
+from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.vision_pose import (
     Firmware,
     PoseEstimate,

@@ -18,7 +18,8 @@ from vcl_companion.cli import main
 from vcl_companion.clock import SystemClock
 from vcl_companion.daemon.check_host import judge_frames
 from vcl_companion.daemon.parameter_rules import findings, rules_for
-from vcl_companion.links.autopilot import AutopilotLink, AutopilotOptions
+from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.vision_pose import Firmware
 
 ROOT = Path(__file__).parents[2]

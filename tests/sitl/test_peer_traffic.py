@@ -9,7 +9,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sitl.peer_traffic import PeerTraffic, Traffic
 from vcl_companion.links.counters import LinkTally
-from vcl_companion.links.mavlink import COMPONENT_COMPANION, Codec
+from vcl_companion.links.mavlink import Codec
+from vcl_companion.links.messages import COMPONENT_COMPANION
 from vcl_companion.wire.chunks import Chunk, Reply, TransferStatus, describe
 from vcl_companion.wire.header import BlobKind
 from vcl_companion.wire.messages import FrameRequest, MapState

@@ -20,7 +20,8 @@ from sitl.autopilots.steered import open_udp
 from vcl_companion.clock import ManualClock
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.links.autopilot import AutopilotLink, AutopilotOptions
+from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.fusion import FusionState
 from vcl_companion.links.vision_pose import PoseEstimate
 

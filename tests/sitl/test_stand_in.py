@@ -28,7 +28,8 @@ from vcl_companion.geometry.rotation import (
     matrix_from_quaternion,
     quaternion_from_matrix,
 )
-from vcl_companion.links.autopilot import AutopilotLink, AutopilotOptions, ServiceState
+from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.autopilot_options import AutopilotOptions, ServiceState
 from vcl_companion.links.texts import Severity
 from vcl_companion.links.vision_pose import PoseEstimate
 

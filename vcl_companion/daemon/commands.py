@@ -20,7 +20,7 @@ from vcl_companion.daemon.exchange import Exchange
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.links.autopilot import AutopilotLink
-from vcl_companion.links.mavlink import (
+from vcl_companion.links.messages import (
     PAUSE_SENDING,
     RELOCALIZE,
     RESULT_ACCEPTED,
@@ -31,8 +31,8 @@ from vcl_companion.links.mavlink import (
     RESULT_TEMPORARILY_REJECTED,
     RESULT_UNSUPPORTED,
     UPDATE_MAP,
+    CommandLong,
 )
-from vcl_companion.links.messages import CommandLong
 from vcl_companion.links.texts import Severity
 
 _log = logging.getLogger(__name__)

@@ -10,7 +10,8 @@ from contextlib import contextmanager
 
 from vcl_companion.daemon import notify
 from vcl_companion.daemon.flight_log import FlightLog
-from vcl_companion.links.autopilot import AutopilotLink, ServiceState
+from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.autopilot_options import ServiceState
 from vcl_companion.links.fusion import Fusion, FusionState
 from vcl_companion.links.texts import Severity
 

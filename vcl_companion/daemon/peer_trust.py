@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.links.autopilot import AutopilotLink
-from vcl_companion.links.mavlink import STATUS_TEXT_BYTES
+from vcl_companion.links.messages import STATUS_TEXT_BYTES
 from vcl_companion.links.texts import Severity
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.quarantine import Evidence, Quarantine, Quarantined, QuarantineOptions

@@ -10,7 +10,8 @@ from functools import partial
 
 from vcl_companion.errors import DeviceError
 from vcl_companion.links.counters import LinkTally
-from vcl_companion.links.mavlink import (
+from vcl_companion.links.mavlink import Codec
+from vcl_companion.links.messages import (
     COMPONENT_COMPANION,
     RESULT_ACCEPTED,
     RESULT_CANCELLED,
@@ -20,9 +21,9 @@ from vcl_companion.links.mavlink import (
     RESULT_TEMPORARILY_REJECTED,
     RESULT_UNSUPPORTED,
     UPDATE_MAP,
-    Codec,
+    CommandAck,
+    Heartbeat,
 )
-from vcl_companion.links.messages import CommandAck, Heartbeat
 from vcl_companion.links.reconnect import Address
 from vcl_companion.links.transport import Transport, open_transport
 

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-import enum
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from vcl_companion.clock import Clock
-from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.rotation import euler_from_matrix, quaternion_from_matrix
 from vcl_companion.links.attitude import Attitude, AttitudeHistory
+from vcl_companion.links.autopilot_options import AutopilotOptions, ServiceState
 from vcl_companion.links.counters import LinkCounters, LinkTally
 from vcl_companion.links.fusion import Fusion, FusionMonitor
-from vcl_companion.links.mavlink import (
+from vcl_companion.links.mavlink import Codec
+from vcl_companion.links.messages import (
     ATTITUDE_QUATERNION_ID,
     COMPONENT_AUTOPILOT,
     COMPONENT_COMPANION,
@@ -29,9 +27,6 @@ from vcl_companion.links.mavlink import (
     LOCAL_POSITION_ID,
     RESULT_ACCEPTED,
     SET_MESSAGE_INTERVAL,
-    Codec,
-)
-from vcl_companion.links.messages import (
     AttitudeSample,
     CommandAck,
     CommandLong,
@@ -47,7 +42,7 @@ from vcl_companion.links.reconnect import Address
 from vcl_companion.links.stream_requests import StreamRequests
 from vcl_companion.links.texts import Severity, Texts
 from vcl_companion.links.timesync import TimesyncEstimator
-from vcl_companion.links.transport import check_allowed_senders, open_transport, parse_link
+from vcl_companion.links.transport import open_transport
 from vcl_companion.links.vision_pose import Firmware, PoseEstimate, covariance_for, firmware_of
 
 _log = logging.getLogger(__name__)
@@ -63,66 +58,6 @@ _REMEMBERS_S = 0.2
 # 0 is what an autopilot that has heard of none takes for known.
 _RESETS = 255
 _FIRMWARE = {"ardupilot": Firmware.ARDUPILOT, "px4": Firmware.PX4}
-
-
-class ServiceState(enum.Enum):
-    """What the heartbeat says of us, as MAV_STATE; STALLED says nothing at all."""
-
-    STARTING = 1
-    STANDBY = 3
-    ACTIVE = 4
-    CRITICAL = 5
-    STALLED = 0
-
-
-@dataclass(frozen=True)
-class AutopilotOptions:
-    """How the autopilot is reached and listened to.
-
-    Attributes:
-        link: serial:DEVICE:BAUD, udp:HOST:PORT, udpin:HOST:PORT or tcp:HOST:PORT.
-        allowed_senders: for udpin, addresses or networks that may be the autopilot; empty: any.
-        attitude_rate_hz: rate of ATTITUDE_QUATERNION that we ask for.
-        attitude_latency_s: from measuring to arriving, for an autopilot without TIMESYNC.
-        max_attitude_age_s: how far from a frame's instant an attitude may be.
-        profile: whose reading of a pose's covariance it is made for: ``ardupilot`` or ``px4``;
-            ``auto``: whose the autopilot's HEARTBEAT says it is; ``plain``: as it is.
-        message: in which poses are sent: ``vision_position_estimate``, or ``odometry``, which
-            holds the velocity as well.
-        ground_systems: MAVLink systems whose commands are obeyed: ground stations.
-        max_pose_age_s: a pose of a frame older than this is not sent.
-        time_error_s: how well the autopilot knows the instant of a pose, 1 sigma: what it is
-            told is uncertain by so much of the way.
-    """
-
-    link: str = "serial:/dev/serial0:921600"
-    allowed_senders: tuple[str, ...] = ()
-    attitude_rate_hz: float = 50.0
-    attitude_latency_s: float = 0.01
-    max_attitude_age_s: float = 0.1
-    profile: Literal["auto", "ardupilot", "px4", "plain"] = "auto"
-    message: Literal["vision_position_estimate", "odometry"] = "vision_position_estimate"
-    ground_systems: tuple[int, ...] = (255,)
-    max_pose_age_s: float = 2.0
-    time_error_s: float = 0.005
-
-    def __post_init__(self) -> None:
-        parse_link(self.link)
-        check_allowed_senders(self.allowed_senders)
-        if not 1.0 <= self.attitude_rate_hz <= 400.0:
-            raise ConfigError(f"attitude_rate_hz: must be in 1..400, got {self.attitude_rate_hz}")
-        if not 0.0 <= self.attitude_latency_s <= 1.0:
-            raise ConfigError(f"attitude_latency_s: must be in 0..1, got {self.attitude_latency_s}")
-        if not 0.0 < self.max_attitude_age_s <= 2.0:
-            raise ConfigError(
-                f"max_attitude_age_s: must be above 0 up to 2, got {self.max_attitude_age_s}"
-            )
-        if not all(1 <= system <= 255 for system in self.ground_systems):
-            raise ConfigError(f"ground_systems: must be in 1..255, got {self.ground_systems}")
-        if not 0.05 <= self.max_pose_age_s <= 10.0:
-            raise ConfigError(f"max_pose_age_s: must be in 0.05..10, got {self.max_pose_age_s}")
-        if not 0.0 <= self.time_error_s <= 0.1:
-            raise ConfigError(f"time_error_s: must be in 0..0.1, got {self.time_error_s}")
 
 
 class AutopilotLink:

@@ -31,7 +31,7 @@ _LASTS_NS = 1_000_000_000
 # and a delay of our poses that it does not know of.
 _APART_M, _SIGMAS, _DELAY_S = 0.5, 5.0, 0.25
 _MAX_KEPT = 256
-# Metres that have to be flown before the delay is told.
+# What squares of the speed have to add up to before the delay is told: 20 s at 1 m/s and 5 Hz.
 _TELLS_OF_DELAY_M2_S2 = 100.0
 _FORGETS = 0.999
 

@@ -28,22 +28,18 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from vcl_companion.clock import Moment, system_moment
-from vcl_companion.geometry.rotation import Array, matrix_from_euler, matrix_from_quaternion
+from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.counters import LinkTally
 from vcl_companion.links.messages import (
-    AttitudeSample,
-    CommandAck,
-    CommandLong,
-    EstimatorStatus,
-    Heartbeat,
-    LocalPosition,
+    COMPONENT_AUTOPILOT,
+    COMPONENT_COMPANION,
+    MAX_TUNNEL_BYTES,
+    SET_MESSAGE_INTERVAL,
     Message,
-    ParameterValue,
-    StatusText,
     Timesync,
-    Tunnel,
     Untimely,
 )
+from vcl_companion.links.readers import READERS, TIMESYNC_LAYOUT
 from vcl_companion.links.signing import (
     AHEAD,
     BEHIND,
@@ -53,34 +49,10 @@ from vcl_companion.links.signing import (
     timestamp_of,
 )
 
-COMPONENT_AUTOPILOT = 1
-COMPONENT_COMPANION = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
-MAX_TUNNEL_BYTES = 128
-STATUS_TEXT_BYTES = 50
-SET_MESSAGE_INTERVAL = 511
-ATTITUDE_QUATERNION_ID = 31
-LOCAL_POSITION_ID = 32
-EKF_STATUS_REPORT_ID = 193
-ESTIMATOR_STATUS_ID = 230
-RESULT_ACCEPTED, RESULT_TEMPORARILY_REJECTED, RESULT_DENIED, RESULT_UNSUPPORTED = 0, 1, 2, 3
-RESULT_FAILED, RESULT_IN_PROGRESS, RESULT_CANCELLED = 4, 5, 6
-UPDATE_MAP, RELOCALIZE, PAUSE_SENDING = 31010, 31013, 31014  # MAV_CMD_USER_1, 4, 5
-FRAME_LOCAL_NED, FRAME_LOCAL_FRD = 1, 20
-
 _MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
 _OVERHEAD_1, _OVERHEAD_2 = 8, 12
-_HEAD_2 = 10
 _CHECKSUM_BYTES = 2
-_QUATERNION_NORM_TOLERANCE = 0.05
-# The same bits in EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS
-_POSITION_RELATIVE, _POSITION_ABSOLUTE, _POSITION_CONSTANT = 0x8, 0x10, 0x80
 
-# TIMESYNC with the extension fields that pymavlink's layout ends before
-# | 0  | i64 | tc1                                                    |
-# | 8  | i64 | ts1                                                    |
-# | 16 | u8  | target system: of who is asked, or has asked; 0 for any |
-# | 17 | u8  | its component                                          |
-_TIMESYNC = struct.Struct("<qqBB")
 # PARAM_SET, its value as bytes: an integer's may be a float that is not a number
 # | 0  | 4s  | value            |
 # | 4  | u8  | target system    |
@@ -88,7 +60,6 @@ _TIMESYNC = struct.Struct("<qqBB")
 # | 6  | 16s | name             |
 # | 22 | u8  | MAV_PARAM_TYPE   |
 _PARAMETER_SET = struct.Struct("<4sBB16sB")
-_VALUE_BYTES = 4
 
 
 class Codec:
@@ -202,7 +173,7 @@ class Codec:
 
     def _read(self, frame: bytes, message_id: int) -> Message | str | None:
         """Return a frame's message, why it is refused, or None when nobody wants it."""
-        read = _READERS.get(message_id)
+        read = READERS.get(dialect.mavlink_map[message_id].msgname)
         if read is None:
             return None
         # A layout's payload, cut or with unknown extensions, is padded or cut to its size.
@@ -392,7 +363,7 @@ class _AddressedTimesync(dialect.MAVLink_timesync_message):  # type: ignore[misc
         self._target_system = target_system
 
     def pack(self, mav: Any, force_mavlink1: bool = False) -> bytes:
-        payload = _TIMESYNC.pack(self.tc1, self.ts1, self._target_system, COMPONENT_COMPANION)
+        payload = TIMESYNC_LAYOUT.pack(self.tc1, self.ts1, self._target_system, COMPONENT_COMPANION)
         return bytes(self._pack(mav, self.crc_extra, payload, force_mavlink1=force_mavlink1))
 
 
@@ -410,103 +381,3 @@ class _RawParameterSet(dialect.MAVLink_param_set_message):  # type: ignore[misc]
 def _next_magic(data: bytes, at: int) -> int:
     found = [i for i in (data.find(_MAGIC_1, at), data.find(_MAGIC_2, at)) if i >= 0]
     return min(found, default=len(data))
-
-
-_Sender = tuple[int, int]
-
-
-def _heartbeat(m: Any, sender: _Sender) -> Message | str:
-    return Heartbeat(*sender, m.type, m.autopilot, m.base_mode, m.custom_mode, m.system_status)
-
-
-def _timesync(m: Any, sender: _Sender) -> Message | str:
-    frame = m.get_msgbuf()
-    payload = bytes(frame[_HEAD_2 : _HEAD_2 + min(frame[1], _TIMESYNC.size)])
-    return Timesync(*sender, *_TIMESYNC.unpack(payload.ljust(_TIMESYNC.size, b"\0")))
-
-
-def _attitude(m: Any, sender: _Sender) -> Message | str:
-    angles = (m.roll, m.pitch, m.yaw)
-    if not all(map(math.isfinite, angles)):
-        return "attitude is no rotation"
-    return AttitudeSample(*sender, m.time_boot_ms, matrix_from_euler(*angles), "euler")
-
-
-def _attitude_quaternion(m: Any, sender: _Sender) -> Message | str:
-    quaternion = np.array([m.q1, m.q2, m.q3, m.q4])
-    # Not a number fails this comparison as well.
-    if not abs(float(np.linalg.norm(quaternion)) - 1.0) < _QUATERNION_NORM_TOLERANCE:
-        return "attitude is no rotation"
-    rotation = matrix_from_quaternion(quaternion)
-    return AttitudeSample(*sender, m.time_boot_ms, rotation, "quaternion")
-
-
-def _estimator(flags: int, ratio: float, sender: _Sender) -> Message | str:
-    if not math.isfinite(ratio):
-        return "estimator's test ratio is no number"
-    has_position = bool(flags & (_POSITION_RELATIVE | _POSITION_ABSOLUTE))
-    return EstimatorStatus(*sender, has_position, bool(flags & _POSITION_CONSTANT), ratio)
-
-
-def _ekf_status_report(m: Any, sender: _Sender) -> Message | str:
-    return _estimator(m.flags, m.pos_horiz_variance, sender)
-
-
-def _estimator_status(m: Any, sender: _Sender) -> Message | str:
-    return _estimator(m.flags, m.pos_horiz_ratio, sender)
-
-
-def _local_position(m: Any, sender: _Sender) -> Message | str:
-    values = np.array([m.x, m.y, m.z, m.vx, m.vy, m.vz])
-    if not np.all(np.isfinite(values)):
-        return "local position is no number"
-    return LocalPosition(*sender, m.time_boot_ms, values[:3], values[3:])
-
-
-def _tunnel(m: Any, sender: _Sender) -> Message | str:
-    if m.payload_length > MAX_TUNNEL_BYTES:
-        return "tunnel length is a lie"
-    if m.target_component not in (0, COMPONENT_COMPANION):
-        return "tunnel for another component"
-    payload = bytes(m.payload[: m.payload_length])
-    return Tunnel(*sender, m.target_system, m.payload_type, payload)
-
-
-def _parameter_value(m: Any, sender: _Sender) -> Message | str:
-    name = m.param_id if isinstance(m.param_id, str) else m.param_id.decode("ascii", "replace")
-    # The value's bytes are an integer's for some: what they were as a float must not be lost.
-    frame = m.get_msgbuf()
-    raw = bytes(frame[_HEAD_2 : _HEAD_2 + min(frame[1], _VALUE_BYTES)]).ljust(_VALUE_BYTES, b"\0")
-    return ParameterValue(*sender, name.rstrip("\0"), raw, m.param_type)
-
-
-def _status_text(m: Any, sender: _Sender) -> Message | str:
-    return StatusText(*sender, m.severity, m.text, m.id, m.chunk_seq)
-
-
-def _command_long(m: Any, sender: _Sender) -> Message | str:
-    parameters = (m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7)
-    return CommandLong(
-        *sender, m.target_system, m.target_component, m.command, m.confirmation, parameters
-    )
-
-
-def _command_ack(m: Any, sender: _Sender) -> Message | str:
-    return CommandAck(*sender, m.command, m.result, m.target_system, m.target_component, m.progress)
-
-
-# What becomes of each message: a value, or why it is refused.
-_READERS: dict[int, Callable[[Any, _Sender], Message | str]] = {
-    dialect.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
-    dialect.MAVLINK_MSG_ID_TIMESYNC: _timesync,
-    dialect.MAVLINK_MSG_ID_ATTITUDE: _attitude,
-    dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: _attitude_quaternion,
-    dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _ekf_status_report,
-    dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS: _estimator_status,
-    dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _local_position,
-    dialect.MAVLINK_MSG_ID_PARAM_VALUE: _parameter_value,
-    dialect.MAVLINK_MSG_ID_TUNNEL: _tunnel,
-    dialect.MAVLINK_MSG_ID_STATUSTEXT: _status_text,
-    dialect.MAVLINK_MSG_ID_COMMAND_LONG: _command_long,
-    dialect.MAVLINK_MSG_ID_COMMAND_ACK: _command_ack,
-}

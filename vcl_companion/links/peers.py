@@ -14,8 +14,15 @@ from vcl_companion.clock import Clock, Moment, system_moment
 from vcl_companion.errors import ConfigError
 from vcl_companion.links.counters import LinkCounters, LinkTally
 from vcl_companion.links.kept_signing import KeptSigning
-from vcl_companion.links.mavlink import COMPONENT_COMPANION, Codec
-from vcl_companion.links.messages import Heartbeat, Message, Timesync, Tunnel, Untimely
+from vcl_companion.links.mavlink import Codec
+from vcl_companion.links.messages import (
+    COMPONENT_COMPANION,
+    Heartbeat,
+    Message,
+    Timesync,
+    Tunnel,
+    Untimely,
+)
 from vcl_companion.links.reconnect import Address
 from vcl_companion.links.signing import AHEAD, BEHIND, FORGED, NO_KEY, UNSIGNED, SigningOptions
 from vcl_companion.links.transport import open_peer_socket, parse_peers

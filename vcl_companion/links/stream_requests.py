@@ -6,7 +6,7 @@ import asyncio
 from collections import Counter
 from collections.abc import Callable
 
-from vcl_companion.links.mavlink import (
+from vcl_companion.links.messages import (
     ATTITUDE_QUATERNION_ID,
     EKF_STATUS_REPORT_ID,
     ESTIMATOR_STATUS_ID,

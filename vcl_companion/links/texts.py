@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import enum
 
-from vcl_companion.links.mavlink import STATUS_TEXT_BYTES, Codec
+from vcl_companion.links.mavlink import Codec
+from vcl_companion.links.messages import STATUS_TEXT_BYTES
 from vcl_companion.links.transport import Transport
 
 _MAX_TEXT_BYTES = 8 * STATUS_TEXT_BYTES

@@ -1,0 +1,70 @@
+"""How the autopilot is reached, listened to and told; and what it is told of how we are."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import Literal
+
+from vcl_companion.errors import ConfigError
+from vcl_companion.links.transport import check_allowed_senders, parse_link
+
+
+class ServiceState(enum.Enum):
+    """What the heartbeat says of us, as MAV_STATE; STALLED says nothing at all."""
+
+    STARTING = 1
+    STANDBY = 3
+    ACTIVE = 4
+    CRITICAL = 5
+    STALLED = 0
+
+
+@dataclass(frozen=True)
+class AutopilotOptions:
+    """How the autopilot is reached and listened to.
+
+    Attributes:
+        link: serial:DEVICE:BAUD, udp:HOST:PORT, udpin:HOST:PORT or tcp:HOST:PORT.
+        allowed_senders: for udpin, addresses or networks that may be the autopilot; empty: any.
+        attitude_rate_hz: rate of ATTITUDE_QUATERNION that we ask for.
+        attitude_latency_s: from measuring to arriving, for an autopilot without TIMESYNC.
+        max_attitude_age_s: how far from a frame's instant an attitude may be.
+        profile: whose reading of a pose's covariance it is made for: ``ardupilot`` or ``px4``;
+            ``auto``: whose the autopilot's HEARTBEAT says it is; ``plain``: as it is.
+        message: in which poses are sent: ``vision_position_estimate``, or ``odometry``, which
+            holds the velocity as well.
+        ground_systems: MAVLink systems whose commands are obeyed: ground stations.
+        max_pose_age_s: a pose of a frame older than this is not sent.
+        time_error_s: how well the autopilot knows the instant of a pose, 1 sigma: what it is
+            told is uncertain by so much of the way.
+    """
+
+    link: str = "serial:/dev/serial0:921600"
+    allowed_senders: tuple[str, ...] = ()
+    attitude_rate_hz: float = 50.0
+    attitude_latency_s: float = 0.01
+    max_attitude_age_s: float = 0.1
+    profile: Literal["auto", "ardupilot", "px4", "plain"] = "auto"
+    message: Literal["vision_position_estimate", "odometry"] = "vision_position_estimate"
+    ground_systems: tuple[int, ...] = (255,)
+    max_pose_age_s: float = 2.0
+    time_error_s: float = 0.005
+
+    def __post_init__(self) -> None:
+        parse_link(self.link)
+        check_allowed_senders(self.allowed_senders)
+        if not 1.0 <= self.attitude_rate_hz <= 400.0:
+            raise ConfigError(f"attitude_rate_hz: must be in 1..400, got {self.attitude_rate_hz}")
+        if not 0.0 <= self.attitude_latency_s <= 1.0:
+            raise ConfigError(f"attitude_latency_s: must be in 0..1, got {self.attitude_latency_s}")
+        if not 0.0 < self.max_attitude_age_s <= 2.0:
+            raise ConfigError(
+                f"max_attitude_age_s: must be above 0 up to 2, got {self.max_attitude_age_s}"
+            )
+        if not all(1 <= system <= 255 for system in self.ground_systems):
+            raise ConfigError(f"ground_systems: must be in 1..255, got {self.ground_systems}")
+        if not 0.05 <= self.max_pose_age_s <= 10.0:
+            raise ConfigError(f"max_pose_age_s: must be in 0.05..10, got {self.max_pose_age_s}")
+        if not 0.0 <= self.time_error_s <= 0.1:
+            raise ConfigError(f"time_error_s: must be in 0..0.1, got {self.time_error_s}")

@@ -1,0 +1,139 @@
+"""What pymavlink has decoded, as values of ours, or why it is refused: none of it is trusted."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from vcl_companion.geometry.rotation import matrix_from_euler, matrix_from_quaternion
+from vcl_companion.links.messages import (
+    COMPONENT_COMPANION,
+    MAX_TUNNEL_BYTES,
+    AttitudeSample,
+    CommandAck,
+    CommandLong,
+    EstimatorStatus,
+    Heartbeat,
+    LocalPosition,
+    Message,
+    ParameterValue,
+    StatusText,
+    Timesync,
+    Tunnel,
+)
+
+_HEAD_2 = 10
+_VALUE_BYTES = 4
+_QUATERNION_NORM_TOLERANCE = 0.05
+# The same bits in EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS
+_POSITION_RELATIVE, _POSITION_ABSOLUTE, _POSITION_CONSTANT = 0x8, 0x10, 0x80
+
+# TIMESYNC with the extension fields that pymavlink's layout ends before
+# | 0  | i64 | tc1                                                    |
+# | 8  | i64 | ts1                                                    |
+# | 16 | u8  | target system: of who is asked, or has asked; 0 for any |
+# | 17 | u8  | its component                                          |
+TIMESYNC_LAYOUT = struct.Struct("<qqBB")
+
+_Sender = tuple[int, int]
+
+
+def _heartbeat(m: Any, sender: _Sender) -> Message | str:
+    return Heartbeat(*sender, m.type, m.autopilot, m.base_mode, m.custom_mode, m.system_status)
+
+
+def _timesync(m: Any, sender: _Sender) -> Message | str:
+    frame = m.get_msgbuf()
+    payload = bytes(frame[_HEAD_2 : _HEAD_2 + min(frame[1], TIMESYNC_LAYOUT.size)])
+    return Timesync(*sender, *TIMESYNC_LAYOUT.unpack(payload.ljust(TIMESYNC_LAYOUT.size, b"\0")))
+
+
+def _attitude(m: Any, sender: _Sender) -> Message | str:
+    angles = (m.roll, m.pitch, m.yaw)
+    if not all(map(math.isfinite, angles)):
+        return "attitude is no rotation"
+    return AttitudeSample(*sender, m.time_boot_ms, matrix_from_euler(*angles), "euler")
+
+
+def _attitude_quaternion(m: Any, sender: _Sender) -> Message | str:
+    quaternion = np.array([m.q1, m.q2, m.q3, m.q4])
+    # Not a number fails this comparison as well.
+    if not abs(float(np.linalg.norm(quaternion)) - 1.0) < _QUATERNION_NORM_TOLERANCE:
+        return "attitude is no rotation"
+    rotation = matrix_from_quaternion(quaternion)
+    return AttitudeSample(*sender, m.time_boot_ms, rotation, "quaternion")
+
+
+def _estimator(flags: int, ratio: float, sender: _Sender) -> Message | str:
+    if not math.isfinite(ratio):
+        return "estimator's test ratio is no number"
+    has_position = bool(flags & (_POSITION_RELATIVE | _POSITION_ABSOLUTE))
+    return EstimatorStatus(*sender, has_position, bool(flags & _POSITION_CONSTANT), ratio)
+
+
+def _ekf_status_report(m: Any, sender: _Sender) -> Message | str:
+    return _estimator(m.flags, m.pos_horiz_variance, sender)
+
+
+def _estimator_status(m: Any, sender: _Sender) -> Message | str:
+    return _estimator(m.flags, m.pos_horiz_ratio, sender)
+
+
+def _local_position(m: Any, sender: _Sender) -> Message | str:
+    values = np.array([m.x, m.y, m.z, m.vx, m.vy, m.vz])
+    if not np.all(np.isfinite(values)):
+        return "local position is no number"
+    return LocalPosition(*sender, m.time_boot_ms, values[:3], values[3:])
+
+
+def _tunnel(m: Any, sender: _Sender) -> Message | str:
+    if m.payload_length > MAX_TUNNEL_BYTES:
+        return "tunnel length is a lie"
+    if m.target_component not in (0, COMPONENT_COMPANION):
+        return "tunnel for another component"
+    payload = bytes(m.payload[: m.payload_length])
+    return Tunnel(*sender, m.target_system, m.payload_type, payload)
+
+
+def _parameter_value(m: Any, sender: _Sender) -> Message | str:
+    name = m.param_id if isinstance(m.param_id, str) else m.param_id.decode("ascii", "replace")
+    # The value's bytes are an integer's for some: what they were as a float must not be lost.
+    frame = m.get_msgbuf()
+    raw = bytes(frame[_HEAD_2 : _HEAD_2 + min(frame[1], _VALUE_BYTES)]).ljust(_VALUE_BYTES, b"\0")
+    return ParameterValue(*sender, name.rstrip("\0"), raw, m.param_type)
+
+
+def _status_text(m: Any, sender: _Sender) -> Message | str:
+    return StatusText(*sender, m.severity, m.text, m.id, m.chunk_seq)
+
+
+def _command_long(m: Any, sender: _Sender) -> Message | str:
+    parameters = (m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7)
+    return CommandLong(
+        *sender, m.target_system, m.target_component, m.command, m.confirmation, parameters
+    )
+
+
+def _command_ack(m: Any, sender: _Sender) -> Message | str:
+    return CommandAck(*sender, m.command, m.result, m.target_system, m.target_component, m.progress)
+
+
+# What becomes of each message, by its name: a value, or why it is refused.
+READERS: dict[str, Callable[[Any, _Sender], Message | str]] = {
+    "HEARTBEAT": _heartbeat,
+    "TIMESYNC": _timesync,
+    "ATTITUDE": _attitude,
+    "ATTITUDE_QUATERNION": _attitude_quaternion,
+    "EKF_STATUS_REPORT": _ekf_status_report,
+    "ESTIMATOR_STATUS": _estimator_status,
+    "LOCAL_POSITION_NED": _local_position,
+    "PARAM_VALUE": _parameter_value,
+    "TUNNEL": _tunnel,
+    "STATUSTEXT": _status_text,
+    "COMMAND_LONG": _command_long,
+    "COMMAND_ACK": _command_ack,
+}
