@@ -34,20 +34,14 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from sitl.autopilots.attitude_source import read_table
 from sitl.autopilots.hearing import Hearing, datagrams
 from sitl.autopilots.motion import Motion, RecordedMotion
+from sitl.autopilots.speaking import Backlog, packed
 from sitl.autopilots.steered import open_udp, run_steered, serve
+from sitl.autopilots.vision_parameters import VISION_ALONE
 from sitl.pacing import ATTITUDE_PERIOD_NS
 from vcl_companion.errors import ConfigError
 
-# Vision alone: position, height and heading (its documentation, "Non-GPS Position Estimation").
 PARAMETERS = {
-    "AHRS_EKF_TYPE": 3.0,
-    "VISO_TYPE": 1.0,
-    "EK3_SRC1_POSXY": 6.0,
-    "EK3_SRC1_VELXY": 0.0,
-    "EK3_SRC1_POSZ": 6.0,
-    "EK3_SRC1_VELZ": 0.0,
-    "EK3_SRC1_YAW": 6.0,
-    "GPS1_TYPE": 0.0,
+    **VISION_ALONE,
     # What it hears is as late as we are quick: nothing on the way is to be made up for.
     "VISO_DELAY_MS": 0.0,
     "ARMING_SKIPCHK": -1.0,
@@ -62,9 +56,7 @@ _CHUNK = 4000
 _ANSWERS_WITHIN_S = 20.0
 _LOOK_S = 0.5
 _HEARTBEAT_S = 1.0
-_BACKLOG_NS = 1_000_000_000
 _GROUND_SYSTEM, _GROUND_COMPONENT = 255, 190
-_COMPANION_COMPONENT = 197
 # Attitude is asked for by the companion as well, but not before the recording begins.
 _WANTED_US = {
     dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 20_000,
@@ -270,14 +262,13 @@ class ArduPilot:
         self._as_firmware = dialect.MAVLink(None, options.system_id, 1)
         self._firmware_at: tuple[str, int] | None = None
         self._companion: tuple[str, int] | None = None
-        self._backlog: deque[tuple[int, bytes]] = deque()
+        self._backlog = Backlog()
         # What the companion has sent, and when that arrives.
         self._under_way: deque[tuple[int, bytes]] = deque()
         self._stopped_at_s = time.monotonic()
         self._clock_ahead_ns: int | None = None
         self._asked = False
         self._flags = -1
-        self._next_heartbeat_s = 0.0
         self.n_times_told = 0
 
     def advance_to(self, until_ns: int) -> int:
@@ -303,7 +294,7 @@ class ArduPilot:
         for data, sender in datagrams(self._udp):
             if sender != self._companion:
                 self._companion = sender
-                for _, frame in self._backlog:
+                for frame in self._backlog:
                     self._udp.sendto(frame, sender)
             for message in self._hearing.of(data, self._firmware.now_ns):
                 if message.get_type() == "TIMESYNC" and message.tc1 == 0:
@@ -327,15 +318,15 @@ class ArduPilot:
         if self._clock_ahead_ns is None:
             return
         now_ns = max(1, self._firmware.now_ns + self._clock_ahead_ns)
-        self._to_companion(dialect.MAVLink_timesync_message(now_ns, asked_ns), self._as_firmware)
+        if self._companion is not None:
+            answer = dialect.MAVLink_timesync_message(now_ns, asked_ns)
+            self._udp.sendto(packed(answer, self._as_firmware), self._companion)
         self.n_times_told += 1
 
     def _said(self, data: bytes) -> None:
         """Hand on what the firmware has said, and note what it says of itself."""
         now_ns = self._firmware.now_ns
-        self._backlog.append((now_ns, data))
-        while now_ns - self._backlog[0][0] > _BACKLOG_NS:
-            self._backlog.popleft()
+        self._backlog.add(now_ns, data)
         if self._companion is not None:
             self._udp.sendto(data, self._companion)
         for message in self._parser.parse_buffer(data) or []:
@@ -385,17 +376,7 @@ class ArduPilot:
 
     def _to_firmware(self, message: Any) -> None:
         if self._firmware_at is not None:
-            self._wire.sendto(_packed(message, self._ground), self._firmware_at)
-
-    def _to_companion(self, message: Any, sender: Any) -> None:
-        if self._companion is not None:
-            self._udp.sendto(_packed(message, sender), self._companion)
-
-
-def _packed(message: Any, sender: Any) -> bytes:
-    frame = bytes(message.pack(sender))
-    sender.seq = (sender.seq + 1) % 256
-    return frame
+            self._wire.sendto(packed(message, self._ground), self._firmware_at)
 
 
 def run(options: ArduPilotOptions) -> None:

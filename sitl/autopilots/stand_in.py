@@ -19,7 +19,6 @@ import json
 import socket
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -37,16 +36,17 @@ from sitl.autopilots.attitude_source import (
 )
 from sitl.autopilots.fusing import Fusing, VisionPose
 from sitl.autopilots.hearing import Hearing, datagrams
+from sitl.autopilots.speaking import Backlog, packed
 from sitl.autopilots.steered import open_udp, run_steered, serve
+from sitl.autopilots.vision_parameters import VISION_ALONE
 from vcl_companion.daemon.scheduling import run_before_others
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.rotation import Array, euler_from_matrix, matrix_from_quaternion
 
 # An ArduCopter's that flies on our poses.
 PARAMETERS = {
-    "AHRS_EKF_TYPE": 3.0,
+    **VISION_ALONE,
     "EK3_ENABLE": 1.0,
-    "VISO_TYPE": 1.0,
     "VISO_ORIENT": 0.0,
     "VISO_SCALE": 1.0,
     "VISO_POS_X": 0.0,
@@ -54,17 +54,9 @@ PARAMETERS = {
     "VISO_POS_Z": 0.0,
     "VISO_POS_M_NSE": 0.05,
     "VISO_QUAL_MIN": 0.0,
-    "EK3_SRC1_POSXY": 6.0,
-    "EK3_SRC1_VELXY": 0.0,
-    "EK3_SRC1_POSZ": 6.0,
-    "EK3_SRC1_VELZ": 0.0,
-    "EK3_SRC1_YAW": 6.0,
-    "GPS1_TYPE": 0.0,
 }
 _HEARTBEAT_S = 1.0
 _TIMESYNC_PERIOD_NS = 100_000_000
-# What a companion that connects late is given of the stream it missed.
-_BACKLOG_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -139,7 +131,7 @@ class StandIn:
         self._companion: tuple[str, int] | None = None
         self._fusing = Fusing()
         self._interval_ns: dict[int, int] = {}
-        self._backlog: deque[tuple[int, bytes]] = deque()
+        self._backlog = Backlog()
         self._next_heartbeat_s = 0.0
         self._parameters = {**PARAMETERS, **options.parameters}
         self._streams = {
@@ -201,7 +193,7 @@ class StandIn:
         """Talk to a companion from now on, and give it the newest of what it missed."""
         self._companion = companion
         self._beat()
-        for _, frame in self._backlog:
+        for frame in self._backlog:
             self._udp.sendto(frame, companion)
 
     def _answer(self, message: Any, kind: str) -> None:
@@ -282,13 +274,10 @@ class StandIn:
             dialect.MAVLink_attitude_quaternion_message(boot_ms, *sent, 0.0, 0.0, 0.0),
             dialect.MAVLink_attitude_message(boot_ms, *angles, 0.0, 0.0, 0.0),
         ):
-            self._backlog.append((at_ns, self._send(message)))
-        while at_ns - self._backlog[0][0] > _BACKLOG_NS:
-            self._backlog.popleft()
+            self._backlog.add(at_ns, self._send(message))
 
     def _send(self, message: Any) -> bytes:
-        frame = bytes(message.pack(self._mav))
-        self._mav.seq = (self._mav.seq + 1) % 256
+        frame = packed(message, self._mav)
         if self._companion is not None:
             self._udp.sendto(frame, self._companion)
         return frame

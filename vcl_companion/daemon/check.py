@@ -8,11 +8,11 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass
 
-from vcl_companion.clock import SystemClock
+from vcl_companion.clock import Clock, SystemClock
 from vcl_companion.config import Config
 from vcl_companion.daemon.check_host import Check, Grade, of_camera, of_files, of_wall_clock
 from vcl_companion.daemon.parameter_rules import Finding, findings, names_of, rules_for
@@ -49,14 +49,8 @@ async def check_all(config: Config) -> Outcome:
     clock = SystemClock()
     checks = [*of_files(config), of_wall_clock()]
     checks.append(await of_camera(config, clock))
-    link = AutopilotLink(config.autopilot, config.system_id, clock)
-    running = asyncio.ensure_future(link.run())
-    try:
+    async with _linked(config, clock) as link:
         more, wrong = await _of_autopilot(config, link)
-    finally:
-        running.cancel()
-        with suppress(asyncio.CancelledError, VclError):
-            await running
     return Outcome((*checks, *more), tuple(wrong))
 
 
@@ -68,11 +62,9 @@ async def set_parameters(
     Returns:
         what each was before, and the names of those that did not take their value.
     """
-    link = AutopilotLink(config.autopilot, config.system_id, SystemClock())
-    running = asyncio.ensure_future(link.run())
     before: dict[str, float] = {}
     failed = []
-    try:
+    async with _linked(config, SystemClock()) as link:
         await _heard_of(link)
         for name, value in values.items():
             was = await link.parameter(name)
@@ -81,10 +73,6 @@ async def set_parameters(
                 failed.append(name)
             else:
                 before[name] = was
-    finally:
-        running.cancel()
-        with suppress(asyncio.CancelledError, VclError):
-            await running
     return before, failed
 
 
@@ -98,6 +86,19 @@ def outcome_json(outcome: Outcome) -> str:
         },
         indent=1,
     )
+
+
+@asynccontextmanager
+async def _linked(config: Config, clock: Clock) -> AsyncIterator[AutopilotLink]:
+    """Run a link to the autopilot for as long as it is needed."""
+    link = AutopilotLink(config.autopilot, config.system_id, clock)
+    running = asyncio.ensure_future(link.run())
+    try:
+        yield link
+    finally:
+        running.cancel()
+        with suppress(asyncio.CancelledError, VclError):
+            await running
 
 
 async def _heard_of(link: AutopilotLink) -> bool:
@@ -124,7 +125,7 @@ async def _of_autopilot(config: Config, link: AutopilotLink) -> tuple[list[Check
     checks.append(_of_time(link))
     rules = rules_for(link.firmware, sends_velocity=config.autopilot.message == "odometry")
     values = {}
-    for name in dict.fromkeys(names_of(rules)):
+    for name in names_of(rules):
         value = await link.parameter(name)
         if value is not None:
             values[name] = value

@@ -71,20 +71,21 @@ class Commands:
 
     def take(self, message: CommandLong) -> None:
         """Obey a command, or say why not."""
-        first = message.parameters[0]
-        match message.command:
-            case known if known in (UPDATE_MAP, PAUSE_SENDING) and first not in (0.0, 1.0):
-                self._autopilot.answer(message, RESULT_DENIED)
-            case known if known == UPDATE_MAP:
-                self._cancel(message) if first else self._update(message)
-            case known if known == RELOCALIZE:
-                self._note(message, "relocalize")
-                self._estimator.forget()
-                self._autopilot.answer(message, RESULT_ACCEPTED)
-            case known if known == PAUSE_SENDING:
-                self._pause(message, is_paused=first == 1.0)
-            case _:
-                self._autopilot.answer(message, RESULT_UNSUPPORTED)
+        command, first = message.command, message.parameters[0]
+        if command in (UPDATE_MAP, PAUSE_SENDING) and first not in (0.0, 1.0):
+            self._autopilot.answer(message, RESULT_DENIED)
+        elif command == UPDATE_MAP and first == 1.0:
+            self._cancel(message)
+        elif command == UPDATE_MAP:
+            self._update(message)
+        elif command == RELOCALIZE:
+            self._note(message, "relocalize")
+            self._estimator.forget()
+            self._autopilot.answer(message, RESULT_ACCEPTED)
+        elif command == PAUSE_SENDING:
+            self._pause(message, is_paused=first == 1.0)
+        else:
+            self._autopilot.answer(message, RESULT_UNSUPPORTED)
 
     def _note(self, message: CommandLong, what: str) -> None:
         self._log.event("command", f"{what}, by system {message.sender_system}")

@@ -69,8 +69,8 @@ def rules_for(firmware: Firmware, *, sends_velocity: bool) -> tuple[Rule, ...]:
 
 
 def names_of(rules: tuple[Rule, ...]) -> tuple[str, ...]:
-    """Return every parameter that has to be read."""
-    return tuple(name for rule in rules for name in rule.name)
+    """Return every parameter that has to be read, each once."""
+    return tuple(dict.fromkeys(name for rule in rules for name in rule.name))
 
 
 def findings(rules: tuple[Rule, ...], values: Mapping[str, float]) -> list[Finding]:

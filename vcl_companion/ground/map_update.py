@@ -168,9 +168,7 @@ class MapUpdate:
             line.transport.write(frame)
 
     def _receive(self, line: _Line, data: bytes, _: Address | None) -> bool:
-        is_stream = line.transport.is_stream
-        decode = line.codec.decode_stream if is_stream else line.codec.decode_datagram
-        for message in decode(data):
+        for message in line.codec.decode(data, is_stream=line.transport.is_stream):
             if message.sender_component != COMPONENT_COMPANION:
                 continue
             match message:

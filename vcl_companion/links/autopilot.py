@@ -256,11 +256,8 @@ class AutopilotLink:
         return offset_ns
 
     def _receive(self, data: bytes, _: Address | None) -> bool:
-        decode = (
-            self._codec.decode_stream if self._transport.is_stream else self._codec.decode_datagram
-        )
         accepted = False
-        for message in decode(data):
+        for message in self._codec.decode(data, is_stream=self._transport.is_stream):
             if isinstance(message, CommandLong):
                 self._take_command(message)
             elif message.sender_system != self._system_id:

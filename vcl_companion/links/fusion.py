@@ -131,7 +131,7 @@ class FusionMonitor:
         return state is FusionState.FUSED or self._told.state is FusionState.WAITING
 
     def _seen(self, now_ns: int) -> Fusion:
-        if self._first_sent_ns is None or not self._sent:
+        if self._first_sent_ns is None:
             return Fusion(FusionState.WAITING)
         silent_ns = now_ns - self._sent[-1].at_ns
         if silent_ns > _SILENT_NS:

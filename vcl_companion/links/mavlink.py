@@ -91,6 +91,10 @@ class Codec:
         self._now = now
         self._rest = b""
 
+    def decode(self, data: bytes, *, is_stream: bool) -> list[Message]:
+        """Return the messages that have come over a stream, or in one datagram."""
+        return self.decode_stream(data) if is_stream else self.decode_datagram(data)
+
     def decode_stream(self, data: bytes) -> list[Message]:
         """Return the messages that ``data`` completes, after what came before it."""
         messages, self._rest = self._decode(self._rest + data)
@@ -203,22 +207,16 @@ class Codec:
 
     def heartbeat(self, system_status: int) -> bytes:
         """Return a companion's HEARTBEAT with a MAV_STATE."""
-        return self._pack(
-            dialect.MAVLink_heartbeat_message(
-                dialect.MAV_TYPE_ONBOARD_CONTROLLER,
-                dialect.MAV_AUTOPILOT_INVALID,
-                0,
-                0,
-                system_status,
-                3,
-            )
-        )
+        return self._heartbeat(dialect.MAV_TYPE_ONBOARD_CONTROLLER, system_status)
 
     def ground_heartbeat(self) -> bytes:
         """Return a ground station's HEARTBEAT."""
+        return self._heartbeat(dialect.MAV_TYPE_GCS, dialect.MAV_STATE_UNINIT)
+
+    def _heartbeat(self, vehicle_type: int, system_status: int) -> bytes:
         return self._pack(
             dialect.MAVLink_heartbeat_message(
-                dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3
+                vehicle_type, dialect.MAV_AUTOPILOT_INVALID, 0, 0, system_status, 3
             )
         )
 

@@ -14,28 +14,26 @@ from contextlib import suppress
 from vcl_companion.links.messages import ParameterValue
 from vcl_companion.links.vision_pose import Firmware
 
-_FLOAT, _INT32, _UINT32 = struct.Struct("<f"), struct.Struct("<i"), struct.Struct("<I")
-# MAV_PARAM_TYPE
-_TYPE_UINT32, _TYPE_INT32, _TYPE_REAL32 = 5, 6, 9
+_FLOAT = struct.Struct("<f")
+# By MAV_PARAM_TYPE: UINT32, INT32
+_INTEGERS = {5: struct.Struct("<I"), 6: struct.Struct("<i")}
 _ANSWER_S = 0.5
 _N_ATTEMPTS = 4
 
 
 def value_of(message: ParameterValue, firmware: Firmware) -> float:
     """Return a parameter's value as its firmware means its bytes."""
-    form = _FLOAT
-    if firmware is Firmware.PX4:
-        form = {_TYPE_INT32: _INT32, _TYPE_UINT32: _UINT32}.get(message.kind, _FLOAT)
-    return float(form.unpack(message.raw)[0])
+    return float(_form(message.kind, firmware).unpack(message.raw)[0])
 
 
 def raw_of(value: float, kind: int, firmware: Firmware) -> bytes:
     """Return the four bytes of a value for a parameter of a type."""
-    if firmware is Firmware.PX4 and kind == _TYPE_INT32:
-        return _INT32.pack(round(value))
-    if firmware is Firmware.PX4 and kind == _TYPE_UINT32:
-        return _UINT32.pack(round(value))
-    return _FLOAT.pack(value)
+    form = _form(kind, firmware)
+    return form.pack(value if form is _FLOAT else round(value))
+
+
+def _form(kind: int, firmware: Firmware) -> struct.Struct:
+    return _INTEGERS.get(kind, _FLOAT) if firmware is Firmware.PX4 else _FLOAT
 
 
 class Parameters:
