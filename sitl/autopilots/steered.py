@@ -53,18 +53,20 @@ def open_udp() -> socket.socket:
     return udp
 
 
-def serve(autopilot: Steered, udp: socket.socket) -> None:
+def serve(autopilot: Steered, udp: socket.socket, *others: socket.socket) -> None:
     """Obey what comes on stdin until told to finish, or until that ends.
 
     Args:
         autopilot: what is steered.
         udp: the companion's end of it.
+        others: sockets at which it takes in what arrives as well.
 
     Raises:
         ConfigError: a line is no command.
     """
     with selectors.DefaultSelector() as selector:
-        selector.register(udp, selectors.EVENT_READ)
+        for one in (udp, *others):
+            selector.register(one, selectors.EVENT_READ)
         selector.register(sys.stdin.fileno(), selectors.EVENT_READ)
         _say({"port": udp.getsockname()[1]})
         unread = b""

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sitl.autopilots.ardupilot import read_options
+from sitl.autopilots.firmware_options import read_options
 from sitl.evaluation import Estimates
 from sitl.firmware import FirmwareBinary, parse_firmware
 from sitl.fly import fly
@@ -119,10 +119,10 @@ def test_a_wrong_configuration_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "ardupilot.json"
     path.write_text(json.dumps({"binary": "/bin/true"}))
     with pytest.raises(ConfigError, match="key 'attitude' is missing"):
-        read_options(path)
+        read_options(path, {})
     path.write_text("{")
     with pytest.raises(ConfigError, match=r"ardupilot\.json"):
-        read_options(path)
+        read_options(path, {})
 
 
 def test_what_a_firmware_was_never_sent_it_has_not_fused(tmp_path: Path) -> None:

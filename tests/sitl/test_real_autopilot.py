@@ -14,7 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sitl.autopilots.ardupilot import PARAMETERS, ArduPilot, ArduPilotOptions
+from sitl.autopilots.ardupilot import PARAMETERS, ArduCopter
+from sitl.autopilots.firmware_options import FirmwareOptions
+from sitl.autopilots.flown import Flown
 from sitl.autopilots.motion import RecordedMotion
 from sitl.autopilots.steered import open_udp
 from vcl_companion.clock import ManualClock
@@ -48,7 +50,7 @@ def motion() -> RecordedMotion:
 class Flight:
     """The firmware, our link to it, and a drone that knows where it is."""
 
-    def __init__(self, autopilot: ArduPilot, port: int, true: RecordedMotion) -> None:
+    def __init__(self, autopilot: Flown, port: int, true: RecordedMotion) -> None:
         self.clock = ManualClock(START_NS)
         options = AutopilotOptions(link=f"udp:127.0.0.1:{port}")
         self.link = AutopilotLink(options, SYSTEM, self.clock)
@@ -95,18 +97,13 @@ class Flight:
 def flown(tmp_path: Path, scenario: Callable[[Flight, Path], Coroutine[None, None, None]]) -> None:
     true = motion()
     out = tmp_path / "mav1"
-    out.mkdir()
-    options = ArduPilotOptions(
+    options = FirmwareOptions(
         Path(_BINARY), SYSTEM, START_NS - BOOTED_BEFORE_NS, true, PARAMETERS, 0.0, out,
         tmp_path / "firmware",
     )  # fmt: skip
     with ExitStack() as stack:
         udp = stack.enter_context(open_udp())
-        files = [
-            stack.enter_context((out / name).open("w", buffering=1))
-            for name in ("attitude.csv", "fused.csv", "received.jsonl", "said.csv")
-        ]
-        autopilot = ArduPilot(options, udp, stack, *files)
+        autopilot = Flown(options, ArduCopter, udp, stack)
         autopilot.advance_to(START_NS)
 
         async def run() -> None:

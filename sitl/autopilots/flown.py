@@ -1,0 +1,206 @@
+"""A real firmware in a recorded flight, between its sensors and its companion.
+
+The firmware runs in software beside this process, which gives its simulated sensors the
+recording's true motion. It runs in lockstep: its time is the recording's (``steered``). What it
+makes of the companion's poses is written down (``noting``), and what it hears, like the stand-in.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Protocol
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from sitl.autopilots.firmware_options import FirmwareOptions
+from sitl.autopilots.hearing import Hearing, datagrams
+from sitl.autopilots.noting import Noting
+from sitl.autopilots.speaking import Backlog, packed
+from sitl.autopilots.steered import open_udp, run_steered, serve
+from sitl.autopilots.wire import Wire
+from sitl.pacing import ATTITUDE_PERIOD_NS
+
+_HEARTBEAT_S = 1.0
+_GROUND_SYSTEM, _GROUND_COMPONENT = 255, 190
+_STREAM_US, _ESTIMATOR_US = 20_000, 200_000
+
+
+class Firmware(Protocol):
+    """Whosever firmware it is: its clock, its sensors, its ears.
+
+    Attributes:
+        now_ns: the instant of the recording that it has come to.
+        step_ns: how far one step moves it on.
+        estimator_message: id of the message that has its estimator's flags.
+    """
+
+    now_ns: int
+    step_ns: int
+    estimator_message: int
+
+    def step(self) -> None:
+        """Move it on by one step of its clock, and wait until it has done what is due in it."""
+        ...
+
+    def hear(self, frames: Iterable[bytes]) -> None:
+        """Have it take in what reaches it now."""
+        ...
+
+    def said(self) -> Iterator[bytes]:
+        """Yield what it has said to its companion."""
+        ...
+
+
+Start = Callable[[FirmwareOptions, Wire, ExitStack], Firmware]
+
+
+class Flown:
+    """The firmware with its companion on the other side; see ``Steered``.
+
+    Args:
+        options: what it is.
+        start: starts it.
+        udp: the companion's end.
+        stack: ends it, and closes what is written.
+    """
+
+    def __init__(
+        self, options: FirmwareOptions, start: Start, udp: socket.socket, stack: ExitStack
+    ) -> None:
+        self._options = options
+        self._udp = udp
+        options.out.mkdir(parents=True, exist_ok=True)
+        self._noting = Noting(options.out, stack)
+        received = stack.enter_context((options.out / "received.jsonl").open("w", buffering=1))
+        self._hearing = Hearing(received)
+        self.wire = Wire(stack)
+        self._firmware = start(options, self.wire, stack)
+        self._parser = dialect.MAVLink(None)
+        self._parser.robust_parsing = True
+        self._ground = dialect.MAVLink(None, _GROUND_SYSTEM, _GROUND_COMPONENT)
+        self._as_firmware = dialect.MAVLink(None, options.system_id, 1)
+        self._companion: tuple[str, int] | None = None
+        self._backlog = Backlog()
+        # What the companion has sent, and when that arrives.
+        self._under_way: deque[tuple[int, bytes]] = deque()
+        self._stopped_at_s = time.monotonic()
+        self._asked = False
+        self.n_times_told = 0
+
+    def advance_to(self, until_ns: int) -> int:
+        """Move the firmware on to an instant; return the one asked for."""
+        self.receive()
+        while self._firmware.now_ns + self._firmware.step_ns <= until_ns:
+            self._hand_over()
+            self._firmware.step()
+            self._hand_on()
+        self._stopped_at_s = time.monotonic()
+        return until_ns
+
+    def receive(self) -> None:
+        """Take in what the companion has sent: it arrives as much later as that took it.
+
+        The firmware's clock has stood still meanwhile, but for longer than from one stop to the
+        next only because the recording was held. Flat out the companion's work takes no time.
+        """
+        took_s = (time.monotonic() - self._stopped_at_s) * self._options.speed
+        arrives_ns = self._firmware.now_ns + min(round(took_s * 1e9), ATTITUDE_PERIOD_NS)
+        for data, sender in datagrams(self._udp):
+            if sender != self._companion:
+                self._companion = sender
+                for frame in self._backlog:
+                    self._udp.sendto(frame, sender)
+            for message in self._hearing.of(data, self._firmware.now_ns):
+                if message.get_type() == "TIMESYNC" and message.tc1 == 0:
+                    self._tell_time(message.ts1)
+                else:
+                    self._under_way.append((arrives_ns, bytes(message.get_msgbuf())))
+        # What its own threads have brought out since it stopped.
+        self._hand_on()
+
+    def heartbeat_if_due(self) -> float:
+        """Return the seconds to the next look: the firmware's heartbeats go by its own time."""
+        return _HEARTBEAT_S
+
+    def _hand_over(self) -> None:
+        """Give the firmware what has arrived by now."""
+        frames = []
+        while self._under_way and self._under_way[0][0] <= self._firmware.now_ns:
+            frames.append(self._under_way.popleft()[1])
+        if frames:
+            self._firmware.hear(frames)
+
+    def _tell_time(self, asked_ns: int) -> None:
+        """Say for the firmware what its clock shows: while it stands still, it cannot itself."""
+        ahead_ns = self._noting.clock_ahead_ns
+        if ahead_ns is None:
+            return
+        now_ns = max(1, self._firmware.now_ns + ahead_ns)
+        if self._companion is not None:
+            answer = dialect.MAVLink_timesync_message(now_ns, asked_ns)
+            self._udp.sendto(packed(answer, self._as_firmware), self._companion)
+        self.n_times_told += 1
+
+    def _hand_on(self) -> None:
+        """Hand on what the firmware has said, and note what it says of itself."""
+        now_ns = self._firmware.now_ns
+        for data in self._firmware.said():
+            self._backlog.add(now_ns, data)
+            if self._companion is not None:
+                self._udp.sendto(data, self._companion)
+            for message in self._parser.parse_buffer(data) or []:
+                self._noting.note(message, now_ns)
+                if message.get_type() == "HEARTBEAT":
+                    self._beat()
+
+    def _beat(self) -> None:
+        """Answer a heartbeat as a ground station does: with one, and what it wants to hear."""
+        messages: list[Any] = [
+            dialect.MAVLink_heartbeat_message(
+                dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3
+            ),
+            dialect.MAVLink_timesync_message(0, self._firmware.now_ns),
+        ]
+        if not self._asked:
+            self._asked = True
+            # Attitude is asked for by the companion as well, but not before the recording begins.
+            for wanted, interval_us in (
+                (dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, _STREAM_US),
+                (dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, _STREAM_US),
+                (self._firmware.estimator_message, _ESTIMATOR_US),
+            ):
+                messages.append(
+                    dialect.MAVLink_command_long_message(
+                        self._options.system_id, 1, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0,
+                        wanted, interval_us, 0, 0, 0, 0, 0,
+                    )
+                )  # fmt: skip
+        for message in messages:
+            self.wire.write(packed(message, self._ground))
+
+
+def run_flown(
+    name: str, arguments: list[str], read: Callable[[Path], FirmwareOptions], start: Start
+) -> int:
+    """Serve from the command line until told to finish, or until stdin ends; return the exit code.
+
+    Args:
+        name: of the module.
+        arguments: of the command line.
+        read: reads its configuration.
+        start: starts the firmware.
+    """
+
+    def run(path: Path) -> None:
+        options = read(path)
+        with ExitStack() as stack:
+            udp = stack.enter_context(open_udp())
+            autopilot = Flown(options, start, udp, stack)
+            serve(autopilot, udp, autopilot.wire.socket)
+
+    return run_steered(name, arguments, run)

@@ -1,0 +1,59 @@
+"""What a real firmware says of itself, written down for the report.
+
+``attitude.csv``, where its nose points (ATTITUDE_QUATERNION); ``fused.csv``, where it believes to
+be (``at_ns,x,y,z`` of LOCAL_POSITION_NED); ``said.csv``, its texts and its estimator's flags.
+"""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, TextIO
+
+_ESTIMATOR_KINDS = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
+
+
+class Noting:
+    """Writes down what is worth it, at instants of the recording.
+
+    Args:
+        out: the folder of the files.
+        stack: closes them.
+    """
+
+    def __init__(self, out: Path, stack: ExitStack) -> None:
+        def opened(name: str, head: str) -> TextIO:
+            file = stack.enter_context((out / name).open("w", buffering=1))
+            file.write(head)
+            return file
+
+        self._attitudes = opened("attitude.csv", "at_ns,qw,qx,qy,qz\n")
+        self._fused = opened("fused.csv", "at_ns,x,y,z\n")
+        self._texts = opened("said.csv", "at_ns,severity,text\n")
+        self._flags = -1
+        self.clock_ahead_ns: int | None = None
+        """The firmware's clock minus the recording's; None until it has told the time."""
+
+    def note(self, message: Any, now_ns: int) -> None:
+        """Take down one of its messages, read at an instant of the recording."""
+        kind = message.get_type()
+        if kind == "TIMESYNC" and message.tc1 != 0:
+            # It answers within a step or a few: the longest lead is the truest.
+            ahead_ns = message.tc1 - now_ns
+            if self.clock_ahead_ns is None or ahead_ns > self.clock_ahead_ns:
+                self.clock_ahead_ns = ahead_ns
+        elif kind == "STATUSTEXT":
+            self._texts.write(f"{now_ns},{message.severity},{json.dumps(message.text)}\n")
+        elif kind in _ESTIMATOR_KINDS and message.flags != self._flags:
+            self._flags = message.flags
+            self._texts.write(f'{now_ns},6,"estimator flags {message.flags:#x}"\n')
+        elif self.clock_ahead_ns is None:
+            return
+        elif kind == "ATTITUDE_QUATERNION":
+            at_ns = message.time_boot_ms * 1_000_000 - self.clock_ahead_ns
+            quaternion = (message.q1, message.q2, message.q3, message.q4)
+            self._attitudes.write(f"{at_ns},{','.join(map(repr, quaternion))}\n")
+        elif kind == "LOCAL_POSITION_NED":
+            at_ns = message.time_boot_ms * 1_000_000 - self.clock_ahead_ns
+            self._fused.write(f"{at_ns},{message.x!r},{message.y!r},{message.z!r}\n")
