@@ -242,6 +242,84 @@ def fly(
 
 @main.command()
 @click.argument("scenario")
+@click.option("--out", required=True, metavar="DIR", type=_FOLDER, help="Results; made if absent.")
+@click.option(
+    "--autopilot",
+    metavar="ardupilot=FILE",
+    required=True,
+    help="A real firmware built for simulation: its own model flies.",
+)
+@click.option(
+    "--parameter",
+    "parameters",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Of the --autopilot, set before it starts (repeatable).",
+)
+@click.option(
+    "--speed",
+    default="1",
+    show_default=True,
+    metavar="X|max",
+    callback=_speed,
+    help="Seconds of the flight per second but for rendering, or max: as fast as all keep up.",
+)
+@click.option(
+    "--drones", default="", metavar="mav0,mav1", help="Only these fly; otherwise all of them."
+)
+@click.option(
+    "--start-timeout",
+    default=60.0,
+    show_default=True,
+    metavar="S",
+    help="How long the daemons have to come up, and again to make the first map.",
+)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="SECTION.KEY=VALUE",
+    help="More of the daemons' configuration, the value in TOML's notation (repeatable).",
+)
+def live(
+    scenario: str,
+    out: Path,
+    autopilot: str,
+    parameters: tuple[str, ...],
+    speed: float,
+    drones: str,
+    start_timeout: float,
+    settings: tuple[str, ...],
+) -> None:
+    """Fly the missions of SCENARIO without GPS (a TOML file, or the name of an embedded one).
+
+    The firmware's own model of a quad flies, what its camera sees is rendered, and its estimator
+    has nothing but our poses. Leaves what a flight leaves, and DIR/recording, to be flown again.
+    Exit status: 0, 2 for input that cannot be used, 1 when a process ended.
+    """
+    from rich.console import Console
+
+    from sitl.firmware import parse_firmware
+    from sitl.live import fly_live
+    from sitl.plan import FlyOptions, parse_setting
+    from sitl.scenario import load_scenario
+    from sitl.terminal import progress_shown, show_report
+
+    options = FlyOptions(
+        speed=speed,
+        drones=tuple(name.strip() for name in drones.split(",") if name.strip()),
+        start_timeout_s=start_timeout,
+        settings=tuple(map(parse_setting, settings)),
+        firmware=parse_firmware(autopilot, parameters),
+    )
+    console = Console()
+    with progress_shown(console) as progress:
+        report = fly_live(load_scenario(scenario), out, options, progress)
+    show_report(console, report, out)
+
+
+@main.command()
+@click.argument("scenario")
 @click.option("--out", required=True, metavar="DIR", type=_FOLDER, help="A new or empty folder.")
 def render(scenario: str, out: Path) -> None:
     """Render SCENARIO (a TOML file, or the name of an embedded one) into a recording."""

@@ -29,6 +29,8 @@ def daemon_config(
     """Return one daemon's configuration: where everything is, and nothing of the truth."""
     run = out / "run" / planned.name
     calibration = plan.recording.path.resolve() / planned.name / CAMERA_FOLDER / "sensor.yaml"
+    if planned.mission is not None:  # the recording is made as it flies
+        calibration = run / "sensor.yaml"
     wiring = {
         "system_id": planned.system_id,
         "clock": "camera",

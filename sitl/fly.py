@@ -20,6 +20,7 @@ from sitl.plan import FlightPlan, FlyOptions, plan_flight
 from sitl.processes import FlightError, unless_one_ends
 from sitl.report import write_report
 from sitl.result import Event, gather
+from sitl.shots import RecordedShots, Shots
 from sitl.swarm import Swarm
 from sitl.trajectory_files import write_trajectories
 from vcl_companion.daemon.scheduling import run_among_others, run_before_others
@@ -40,12 +41,14 @@ class Conduct:
         start_s: wall time from the first frame to the first map.
         flight_s: wall time of everything after.
         late_ms: by how much each frame was handed out later than it was due.
+        ended_at_ns: recording time when the last frame was answered.
         events: what should be known.
     """
 
     start_s: float = 0.0
     flight_s: float = 0.0
     late_ms: list[float] = field(default_factory=list)
+    ended_at_ns: int = 0
     events: list[Event] = field(default_factory=list)
 
 
@@ -60,10 +63,23 @@ def fly(recording_path: Path, out: Path, options: FlyOptions, progress: Progress
     progress("reading the recording", 0, 0)
     plan = plan_flight(read_recording(recording_path), options)
     prepare_folder(out, plan)
+    return reported(plan, out, flown(plan, out, RecordedShots(), progress), progress)
+
+
+def flown(plan: FlightPlan, out: Path, shots: Shots, progress: Progress) -> Conduct:
+    """Fly what is planned; what became of it is in ``out``.
+
+    Raises:
+        FlightError, KeyboardInterrupt: see ``fly``.
+    """
     # Daemons that start together would all compile the same.
     progress("compiling, once on this machine", 0, 0)
     warm_up()
-    conduct = asyncio.run(_flown(plan, out, progress))
+    return asyncio.run(_flown(plan, out, shots, progress))
+
+
+def reported(plan: FlightPlan, out: Path, conduct: Conduct, progress: Progress) -> dict[str, Any]:
+    """Compare a flight with the truth, write its report, and return what report.json says."""
     progress("writing the report", 0, 0)
     result = gather(plan, out, conduct.events)
     write_trajectories(result, out)
@@ -76,18 +92,18 @@ def fly(recording_path: Path, out: Path, options: FlyOptions, progress: Progress
     )
 
 
-async def _flown(plan: FlightPlan, out: Path, progress: Progress) -> Conduct:
+async def _flown(plan: FlightPlan, out: Path, shots: Shots, progress: Progress) -> Conduct:
     swarm = Swarm(plan, out)
     conduct = Conduct()
     with _ended_by_sigterm(), _in_time(plan):
         try:
             progress("starting the daemons", 0, 0)
             await swarm.start()
-            await unless_one_ends(swarm.children, _play(plan, swarm, conduct, progress))
+            await unless_one_ends(swarm.children, _play(plan, swarm, shots, conduct, progress))
             progress("ending the daemons", 0, 0)
             for drone in swarm.drones:
                 if drone.camera.is_connected:
-                    drone.camera.say_end(plan.ends_at_ns)
+                    drone.camera.say_end(conduct.ended_at_ns)
             await swarm.finish()
         finally:
             await swarm.end()
@@ -131,7 +147,9 @@ def _ended_by_sigterm() -> Iterator[None]:
         loop.remove_signal_handler(signal.SIGTERM)
 
 
-async def _play(plan: FlightPlan, swarm: Swarm, conduct: Conduct, progress: Progress) -> None:
+async def _play(
+    plan: FlightPlan, swarm: Swarm, shots: Shots, conduct: Conduct, progress: Progress
+) -> None:
     """Hand out every frame at its time, after the attitude of that instant."""
     speed = plan.options.speed
     flat_out = math.isinf(speed)
@@ -145,11 +163,16 @@ async def _play(plan: FlightPlan, swarm: Swarm, conduct: Conduct, progress: Prog
     begun_s = time.monotonic()
     pace = Pace(speed, moments[0].at_ns, begun_s)
     for k, moment in enumerate(moments):
+        if shots.is_over(swarm):
+            break
         if flat_out and moment.frames and k > holds_after:
             await _all_answered(swarm)
         await asyncio.sleep(max(0.0, pace.wait_s(moment.at_ns, time.monotonic())))
         await swarm.kill_and_start(moment.at_ns)
-        await _hand_out(moment, swarm)
+        held_before_s = shots.held_s
+        await _hand_out(moment, swarm, shots)
+        pace = pace.held(shots.held_s - held_before_s)
+        conduct.ended_at_ns = moment.at_ns
         if k == 0:
             await swarm.clocks_related(moment.at_ns)
             pace = Pace(speed, moment.at_ns, time.monotonic())
@@ -168,15 +191,15 @@ async def _play(plan: FlightPlan, swarm: Swarm, conduct: Conduct, progress: Prog
     conduct.flight_s = time.monotonic() - begun_s - conduct.start_s
 
 
-async def _hand_out(moment: Instant, swarm: Swarm) -> None:
+async def _hand_out(moment: Instant, swarm: Swarm, shots: Shots) -> None:
     await swarm.advance_to(moment.at_ns)
     given = {due.drone: due for due in moment.frames}
+    images = await shots.taken(moment, swarm)
     for n, drone in enumerate(swarm.drones):
         if not drone.camera.is_connected:
             continue  # nobody is there to see it
         if n in given:
-            frame = drone.planned.drone.frames[given[n].sequence]
-            drone.camera.give(given[n].sequence, moment.at_ns, frame.path.read_bytes())
+            drone.camera.give(given[n].sequence, moment.at_ns, images[n])
         else:
             drone.camera.tell_time(moment.at_ns)
 

@@ -6,17 +6,15 @@ has a position by what it is sent. Its local frame is the ``world`` of our poses
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sitl.autopilots.motion import RecordedMotion
 from sitl.evaluation import Estimates
+from sitl.page_style import Column
 from sitl.processes import FlightError
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
@@ -27,7 +25,7 @@ FUSED_FILE, SAID_FILE = "fused.csv", "said.csv"
 _POSITION, _CONSTANT_POSITION = 0x8 | 0x10, 0x80
 _FLAGS = '"estimator flags '
 _SETTLES_NS = 2_000_000_000
-FUSED_COLUMNS = (
+FUSED_COLUMNS: tuple[Column, ...] = (
     ("fused_after_s", "fused after s", "{:.2f}", 1.0),
     ("fused_share", "fused %", "{:.1f}", 100.0),
     ("ate_m", "its ATE cm", "{:.2f}", 100.0),
@@ -111,28 +109,6 @@ def read_fused(
         ate_m / own_ate_m if own_ate_m > 0.0 else None,
         None if ahead_s is None else ahead_s * 1e3,
     )
-
-
-def fused_html(report: Mapping[str, Any]) -> str:
-    """Return the table of what the autopilots made of it; empty when none was real."""
-    rows = []
-    for name, drone in report["drones"].items():
-        said = drone["fused"]
-        if said is None:
-            continue
-        cells = fused_cells(said, none="—")
-        rows.append(f"<tr><td>{escape(name)}</td>{''.join(f'<td>{c}</td>' for c in cells)}</tr>")
-    if not rows:
-        return ""
-    heads = "".join(f"<th>{escape(label)}</th>" for _, label, _, _ in FUSED_COLUMNS)
-    head = f"<tr><th>drone</th>{heads}</tr>"
-    return f"<div class=scroll><table>{head}{''.join(rows)}</table></div>"
-
-
-def fused_cells(said: Mapping[str, float | None], none: str) -> list[str]:
-    """Return the columns of one drone's row, as text."""
-    values = ((said[key], form, scale) for key, _, form, scale in FUSED_COLUMNS)
-    return [none if v is None else form.format(scale * v) for v, form, scale in values]
 
 
 def _rms(error: Array) -> float:

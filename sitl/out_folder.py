@@ -7,13 +7,17 @@ import shutil
 from pathlib import Path
 
 from sitl.fused import FUSED_FILE, SAID_FILE
+from sitl.mission import COMMANDED_FILE
 from sitl.plan import FlightPlan
 from vcl_companion.errors import ConfigError
+
+RECORDING_FOLDER = "recording"
+"""What a live flight has recorded."""
 
 _MARK = Path("run") / "flight.json"
 _OWN_FILES = (
     *("estimate.tum", "covariance.csv", "truth.tum", "received.jsonl", "attitude.csv"),
-    *(FUSED_FILE, SAID_FILE),
+    *(FUSED_FILE, SAID_FILE, COMMANDED_FILE),
 )
 _OWN_REPORTS = ("report.json", "report.html")
 
@@ -51,5 +55,6 @@ def _remove_earlier(out: Path) -> None:
             folder.rmdir()
     for name in _OWN_REPORTS:
         (out / name).unlink(missing_ok=True)
-    if (out / "run").is_dir():
-        shutil.rmtree(out / "run")
+    for name in ("run", RECORDING_FOLDER):
+        if (out / name).is_dir():
+            shutil.rmtree(out / name)

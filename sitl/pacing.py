@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,6 +94,10 @@ class Pace:
     speed: float
     origin_at_ns: int
     origin_wall_s: float
+
+    def held(self, wall_s: float) -> Pace:
+        """Return the same after recording time has stood still for so long."""
+        return replace(self, origin_wall_s=self.origin_wall_s + wall_s)
 
     def wait_s(self, at_ns: int, wall_s: float) -> float:
         """Return how long until an instant is due, s; negative when it is late."""

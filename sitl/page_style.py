@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
+from typing import Any
+
+Column = tuple[str, str, str, float | None]
 
 CSS = """
 :root { color-scheme: light; }
@@ -59,6 +62,25 @@ def section(title: str, note: str, content: str) -> str:
     """Return a titled part of a page; note and content are HTML."""
     noted = f"<p class=note>{note}</p>" if note else ""
     return f"<section>\n<h2>{title}</h2>{noted}{content}\n</section>"
+
+
+def cells(columns: Sequence[Column], values: Mapping[str, Any], none: str) -> list[str]:
+    """Return a row's values as texts by its columns: key, head, format, and scale of a number."""
+    out = []
+    for key, _, form, scale in columns:
+        value = values[key]
+        out.append(none if value is None else form.format(scale * value if scale else value))
+    return out
+
+
+def drones_table(report: Mapping[str, Any], part: str, columns: Sequence[Column]) -> str:
+    """Return a table of one part of each drone's report; empty when none has it."""
+    rows = [
+        [name, *cells(columns, drone[part], "—")]
+        for name, drone in report["drones"].items()
+        if drone[part]
+    ]
+    return table(["drone", *(label for _, label, _, _ in columns)], rows) if rows else ""
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sitl.absences import Absence, check_absences
 from sitl.firmware import FirmwareBinary
+from sitl.mission import Mission
 from sitl.network import NetworkOptions
 from sitl.partitions import check_flying
 from vcl_companion.config import Config
@@ -84,11 +85,13 @@ class PlannedDrone:
         drone: what it recorded.
         system_id: its MAVLink system id.
         attitude_path: attitude stream that is sent again; None: made from the truth.
+        mission: what it does by itself in a live flight; None in a recorded one.
     """
 
     drone: Drone
     system_id: int
     attitude_path: Path | None
+    mission: Mission | None = None
 
     @property
     def name(self) -> str:

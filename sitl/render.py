@@ -41,7 +41,7 @@ def render_scenario(scenario: Scenario, out_dir: Path, progress: Progress | None
     images = ImageOptions(scenario.image.format, scenario.image.jpg_quality)
     with RecordingWriter(out_dir, description, images) as writer:
         sensors = {drone.name: scenario.sensor(drone) for drone in scenario.drone}
-        paths = {drone.name: FlightPath(drone.flight) for drone in scenario.drone}
+        paths = {drone.name: drone.path() for drone in scenario.drone}
         for drone in scenario.drone:
             truth = _truth(scenario, drone, paths[drone.name])
             writer.add_drone(drone.name, sensors[drone.name], truth)

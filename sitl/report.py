@@ -18,6 +18,7 @@ Terms beyond ``sitl.evaluation``'s:
   ``features``, on a ``peer`` alone, on attitude and ``motion`` alone, or where ``nothing``
   was sent.
 * ``fused``: what a real autopilot made of our poses (``sitl.fused``); null for a stand-in.
+* ``mission``: how well it was flown (``sitl.flown_mission``); null in a recorded flight.
 * ``lives``: each run of its daemon, in seconds of the recording: when its process was
   ``started_s``, when it was ``ready_s`` (it had connected to its camera, and begins to speak to
   autopilot and peers; starting an interpreter and compiling is before), and when it was
@@ -161,6 +162,7 @@ def _drone(drone: DroneResult, duration_s: float) -> dict[str, Any]:
         "nees_median": scores.nees_median if scores else None,
         "relies_on": shares(log.frames),
         "fused": asdict(drone.fused) if drone.fused else None,
+        "mission": asdict(drone.mission) if drone.mission else None,
         "sources": _sources(drone),
         "latency_ms": {
             name: _percentile(looked_at, share)

@@ -7,10 +7,11 @@ from html import escape
 from typing import Any
 
 from sitl import report_plots
-from sitl.fused import fused_html
+from sitl.flown_mission import MISSION_COLUMNS
+from sitl.fused import FUSED_COLUMNS
 from sitl.lives_report import lives_html
 from sitl.network_report import network_html, network_text
-from sitl.page_style import document, section
+from sitl.page_style import document, drones_table, section
 from sitl.plotting import colour
 from sitl.reliance import RELIANCES, strips_svg
 from sitl.result import FlightResult
@@ -43,10 +44,13 @@ def page(result: FlightResult, report: Mapping[str, Any]) -> str:
     """Return the whole page of a flight; ``report`` is what ``report.json`` says."""
     name = escape(str(report["recording"]))
     errors = report_plots.errors_svg(result)
-    network, lives, fused = network_html(report), lives_html(report), fused_html(report)
+    network, lives = network_html(report), lives_html(report)
+    fused = drones_table(report, "fused", FUSED_COLUMNS)
+    missions = drones_table(report, "mission", MISSION_COLUMNS)
     parts = [
         _alarms(report),
         section("Where they flew", _flight_note(result), report_plots.trajectories_svg(result)),
+        section("Missions", _MISSION_NOTE, missions) if missions else "",
         section("How well", _SCORE_NOTE, _score_table(report)),
         section("What the poses rely on", _RELIANCE_NOTE,
                  strips_svg(result) + _reliance_table(report)),
@@ -70,6 +74,11 @@ _SCORE_NOTE = (
     "“aligned” after the best rotation and shift of each drone's own track. In 3σ: poses whose "
     "error stays within three of their own sigmas along each axis. NEES: median, 5.3 when the "
     "covariance is honest, more when it promises too much."
+)
+_MISSION_NOTE = (
+    "Off its way: how far the truth was from the commanded path, at most and on average, from "
+    "arming to disarming. Its commands are places in our map; the leader's start carries them to "
+    "the truth."
 )
 _RELIANCE_NOTE = (
     "Of each frame: the map, recognised by its patches or, at the start and when lost, by "

@@ -18,6 +18,7 @@ from sitl.evaluation import (
     scores,
 )
 from sitl.flight_log import FlightLog, MapRow, estimates_of, read_received
+from sitl.flown_mission import FlownMission, read_mission
 from sitl.fused import Fused, read_fused
 from sitl.lives import Life, Lives, read_lives, read_log
 from sitl.network_log import NetworkLog, read_network_log
@@ -60,6 +61,7 @@ class DroneResult:
         alone: the same of what was fused: ``intra``, the frames' own fixes, and
             ``inter``, the peers' proposals, each as it came; only those there were.
         fused: what a real autopilot made of what it was sent; None without one.
+        mission: how it was flown; None in a recorded flight.
         given: (G,) which frames a living daemon was given.
         lives: of its daemon, in order.
     """
@@ -74,6 +76,7 @@ class DroneResult:
     scores: Scores | None
     alone: Mapping[str, Scores]
     fused: Fused | None
+    mission: FlownMission | None
     given: NDArray[np.int64]
     lives: tuple[Life, ...]
 
@@ -210,6 +213,7 @@ def _drone_result(
         scores=scores(errors, axes) if errors is not None else None,
         alone={} if alignment is None else _alone(planned, truth, log, alignment, axes),
         fused=read_fused(out / planned.name, estimates, planned.drone.truth, alignment),
+        mission=read_mission(out / planned.name, planned.drone.truth, alignment),
         given=np.array(every if lives is None else lives.frames, dtype=np.int64),
         lives=() if lives is None else tuple(lives.lives),
     )

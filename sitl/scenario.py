@@ -11,14 +11,16 @@ import difflib
 import re
 import tomllib
 from pathlib import Path
+from types import NoneType, UnionType
 from typing import Any, Literal, get_args, get_type_hints
 
 import msgspec
 import numpy as np
 
+from sitl.mission import Mission
 from sitl.renderer import Imaging
 from sitl.town import Town
-from sitl.trajectories import Flight
+from sitl.trajectories import Flight, FlightPath
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.camera import Camera, DistortionModel
 from vcl_companion.geometry.pose import Pose
@@ -104,14 +106,16 @@ class DroneInScenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         name: mav0, mav1, ...
-        flight: its path.
+        flight: its path, in a scenario to be rendered.
+        mission: what it is to do, in one to be flown live; one of the two.
         gain: its camera's exposure against the others'.
         delay_s: how much later than the scenario's instants it takes its frames.
         tilt_deg: its camera looks so much higher than the others', lower when negative.
     """
 
     name: str
-    flight: Flight
+    flight: Flight | None = None
+    mission: Mission | None = None
     gain: float = 1.0
     delay_s: float = 0.0
     tilt_deg: float = 0.0
@@ -119,10 +123,22 @@ class DroneInScenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if not re.fullmatch(r"mav[0-9]{1,6}", self.name):
             raise ValueError(f"drone: names are mav0, mav1, ...; got {self.name!r}")
+        if (self.flight is None) == (self.mission is None):
+            raise ValueError(f"drone {self.name}: it has either a flight or a mission")
         if not self.gain > 0.0 or not 0.0 <= self.delay_s < 10.0:
             raise ValueError(f"drone {self.name}: gain is positive, delay_s is 0 to 10")
         if not -90.0 <= self.tilt_deg <= 90.0:
             raise ValueError(f"drone {self.name}: tilt_deg is -90 to 90")
+
+    def path(self) -> FlightPath:
+        """Return how it moves.
+
+        Raises:
+            ConfigError: nobody knows before it has flown.
+        """
+        if self.flight is None:
+            raise ConfigError(f"{self.name} has a mission: fly it by python -m sitl live")
+        return FlightPath(self.flight)
 
 
 class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -231,6 +247,8 @@ def _table(path: Path) -> dict[str, Any]:
 
 def _refuse_unknown(value: object, kind: Any, path: Path, where: str) -> None:
     """Raise ConfigError at the first key that its table cannot have, naming the nearest one."""
+    if isinstance(kind, UnionType):  # one that may be absent
+        kind = next(k for k in get_args(kind) if k is not NoneType)
     if isinstance(value, list):
         inner = next((k for k in get_args(kind) if k is not Ellipsis), None)
         for i, item in enumerate(value):

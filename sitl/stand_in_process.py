@@ -7,9 +7,11 @@ import json
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
+
+import msgspec
 
 from sitl.plan import FlightPlan, PlannedDrone
 from sitl.processes import Child, FlightError, start_child
@@ -22,12 +24,19 @@ _BOOTED_BEFORE_NS = 60_000_000_000
 _BOOTED_APART_NS = 7_000_000_000
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class StandIn:
-    """A running stand-in and the UDP port that it listens on."""
+    """A running stand-in and the UDP port that it listens on.
+
+    Attributes:
+        child: its process.
+        port: of 127.0.0.1.
+        state: what it said last of the instant that it was moved on to (``steered``).
+    """
 
     child: Child
     port: int
+    state: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     async def of(cls, child: Child) -> Self:
@@ -45,6 +54,7 @@ class StandIn:
         """
         await _say(self.child, {"advance_to_ns": at_ns})
         answer = await _reply(self.child)
+        self.state = answer
         told = answer.get("times_told")
         if answer.get("at_ns") != at_ns or not isinstance(told, int):
             raise FlightError(f"{self.child.name} was told {at_ns} ns and answers {answer}")
@@ -86,8 +96,11 @@ async def start_stand_in(
 
 def stand_in_config(plan: FlightPlan, planned: PlannedDrone, out: Path) -> dict[str, Any]:
     """Return an autopilot's configuration; writes the truth it measures, if it does, to a file."""
-    if planned.attitude_path is not None:
-        attitude: dict[str, Any] = {"source": "replay", "file": str(planned.attitude_path)}
+    if planned.mission is not None:
+        begins_ns = plan.starts_at_ns + round(planned.mission.begins_s * 1e9)
+        flies = {"mission": msgspec.to_builtins(planned.mission), "begins_ns": begins_ns}
+    elif planned.attitude_path is not None:
+        flies = {"attitude": {"source": "replay", "file": str(planned.attitude_path)}}
     else:
         truth_path = out / "run" / planned.name / "truth.csv"
         truth = planned.drone.truth
@@ -96,12 +109,12 @@ def stand_in_config(plan: FlightPlan, planned: PlannedDrone, out: Path) -> dict[
         truth_path.write_text(_trajectory_text(truth), encoding="utf-8")
         # Different errors for every drone, the same whoever else flies.
         seed = 256 * plan.options.seed + planned.system_id
-        attitude = {"source": "truth", "file": str(truth_path), "seed": seed}
+        flies = {"attitude": {"source": "truth", "file": str(truth_path), "seed": seed}}
     booted_before_ns = _BOOTED_BEFORE_NS + planned.system_id * _BOOTED_APART_NS
     return {
         "system_id": planned.system_id,
         "boot_offset_ns": plan.starts_at_ns - booted_before_ns,
-        "attitude": attitude,
+        **flies,
         **_firmware_config(plan, out / "run" / planned.name / "firmware"),
         # An autopilot has a processor of its own.
         "realtime": not math.isinf(plan.options.speed),

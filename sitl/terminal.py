@@ -14,11 +14,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from sitl.flown_mission import MISSION_COLUMNS
 from sitl.fly import Progress
-from sitl.fused import FUSED_COLUMNS, fused_cells
+from sitl.fused import FUSED_COLUMNS
 from sitl.goals import Goal
 from sitl.lives_report import LIFE_COLUMNS, life_rows
 from sitl.network_report import DELAYS, NETWORK_COLUMNS, delay_text, message_rows
+from sitl.page_style import Column, cells
 
 
 @contextmanager
@@ -80,7 +82,8 @@ def show_report(console: Console, report: Mapping[str, Any], out: Path) -> None:
             _number(drone["resident_mb"], 0),
         )
     console.print(table)
-    _show_fused(console, report)
+    _show_parts(console, report, "fused", "autopilot", FUSED_COLUMNS)
+    _show_parts(console, report, "mission", "drone", MISSION_COLUMNS)
     lives = life_rows(report)
     if lives:
         heads = (label.replace(" s", "\ns") for _, label in LIFE_COLUMNS)
@@ -96,15 +99,17 @@ def show_report(console: Console, report: Mapping[str, Any], out: Path) -> None:
     console.print(f"report: {out / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
 
 
-def _show_fused(console: Console, report: Mapping[str, Any]) -> None:
-    """Print what real autopilots made of the poses."""
-    said = {name: drone["fused"] for name, drone in report["drones"].items() if drone["fused"]}
+def _show_parts(
+    console: Console, report: Mapping[str, Any], part: str, whose: str, columns: Sequence[Column]
+) -> None:
+    """Print one part of each drone's report, if there is one."""
+    said = {name: drone[part] for name, drone in report["drones"].items() if drone[part]}
     if not said:
         return
-    heads = (_broken(label) for _, label, _, _ in FUSED_COLUMNS)
-    table = _numbers(("autopilot", *heads))
-    for name, fused in said.items():
-        table.add_row(name, *fused_cells(fused, none="-"))
+    heads = (_broken(label) for _, label, _, _ in columns)
+    table = _numbers((whose, *heads))
+    for name, values in said.items():
+        table.add_row(name, *cells(columns, values, none="-"))
     console.print(table)
 
 

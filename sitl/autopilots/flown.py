@@ -1,8 +1,9 @@
-"""A real firmware in a recorded flight, between its sensors and its companion.
+"""A real firmware in a flight, between its sensors and its companion.
 
-The firmware runs in software beside this process, which gives its simulated sensors the
-recording's true motion. It runs in lockstep: its time is the recording's (``steered``). What it
-makes of the companion's poses is written down (``noting``), and what it hears, like the stand-in.
+The firmware runs in software beside this process, which gives its simulated sensors a
+recording's true motion, or lets it fly by itself, commanded by a pilot. It runs in lockstep: its
+time is the flight's (``steered``). What it makes of the companion's poses is written down
+(``noting``), and what it hears, like the stand-in.
 """
 
 from __future__ import annotations
@@ -13,17 +14,20 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from sitl.autopilots.firmware_options import FirmwareOptions
+from sitl.autopilots.firmware_options import FirmwareOptions, Orders
 from sitl.autopilots.hearing import Hearing, datagrams
 from sitl.autopilots.noting import Noting
+from sitl.autopilots.own_network import enter_own_network
+from sitl.autopilots.pilot import Phase, Pilot
 from sitl.autopilots.speaking import Backlog, packed
 from sitl.autopilots.steered import open_udp, run_steered, serve
 from sitl.autopilots.wire import Wire
 from sitl.pacing import ATTITUDE_PERIOD_NS
+from vcl_companion.geometry.pose import Pose
 
 _HEARTBEAT_S = 1.0
 _GROUND_SYSTEM, _GROUND_COMPONENT = 255, 190
@@ -35,13 +39,15 @@ class Firmware(Protocol):
 
     Attributes:
         now_ns: the instant of the recording that it has come to.
-        step_ns: how far one step moves it on.
         estimator_message: id of the message that has its estimator's flags.
     """
 
     now_ns: int
-    step_ns: int
     estimator_message: int
+
+    def is_due(self, until_ns: int) -> bool:
+        """Return whether one more step is to be done until an instant."""
+        ...
 
     def step(self) -> None:
         """Move it on by one step of its clock, and wait until it has done what is due in it."""
@@ -53,6 +59,15 @@ class Firmware(Protocol):
 
     def said(self) -> Iterator[bytes]:
         """Yield what it has said to its companion."""
+        ...
+
+
+@runtime_checkable
+class FlyingFirmware(Firmware, Protocol):
+    """One that flies by its own physics."""
+
+    def ned_from_body(self, at_ns: int) -> Pose:
+        """Return where it truly is at an instant of its last step."""
         ...
 
 
@@ -84,6 +99,9 @@ class Flown:
         self._parser.robust_parsing = True
         self._ground = dialect.MAVLink(None, _GROUND_SYSTEM, _GROUND_COMPONENT)
         self._as_firmware = dialect.MAVLink(None, options.system_id, 1)
+        self._pilot: Pilot | None = None
+        if isinstance(options.flies, Orders):
+            self._pilot = Pilot(options.flies, options.system_id, self._command, options.out, stack)
         self._companion: tuple[str, int] | None = None
         self._backlog = Backlog()
         # What the companion has sent, and when that arrives.
@@ -95,12 +113,26 @@ class Flown:
     def advance_to(self, until_ns: int) -> int:
         """Move the firmware on to an instant; return the one asked for."""
         self.receive()
-        while self._firmware.now_ns + self._firmware.step_ns <= until_ns:
+        while self._firmware.is_due(until_ns):
             self._hand_over()
             self._firmware.step()
             self._hand_on()
+        if self._pilot is not None:
+            self._pilot.go_on(until_ns)
         self._stopped_at_s = time.monotonic()
         return until_ns
+
+    def state(self, at_ns: int) -> dict[str, object]:
+        """Return where it truly is and how far its mission has come, if it flies by itself."""
+        if self._pilot is None or not isinstance(self._firmware, FlyingFirmware):
+            return {}
+        pose = self._firmware.ned_from_body(at_ns)
+        return {
+            "pose": [*pose.translation.tolist(), *pose.quaternion().tolist()],
+            "mission": self._pilot.says,
+            "is_over": self._pilot.phase is Phase.OVER,
+            "trouble": self._pilot.trouble,
+        }
 
     def receive(self) -> None:
         """Take in what the companion has sent: it arrives as much later as that took it.
@@ -155,6 +187,8 @@ class Flown:
                 self._udp.sendto(data, self._companion)
             for message in self._parser.parse_buffer(data) or []:
                 self._noting.note(message, now_ns)
+                if self._pilot is not None:
+                    self._pilot.hear(message)
                 if message.get_type() == "HEARTBEAT":
                     self._beat()
 
@@ -172,6 +206,7 @@ class Flown:
             for wanted, interval_us in (
                 (dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, _STREAM_US),
                 (dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, _STREAM_US),
+                (dialect.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED, _ESTIMATOR_US),
                 (self._firmware.estimator_message, _ESTIMATOR_US),
             ):
                 messages.append(
@@ -181,7 +216,10 @@ class Flown:
                     )
                 )  # fmt: skip
         for message in messages:
-            self.wire.write(packed(message, self._ground))
+            self._command(message)
+
+    def _command(self, message: Any) -> None:
+        self.wire.write(packed(message, self._ground))
 
 
 def run_flown(
@@ -200,6 +238,9 @@ def run_flown(
         options = read(path)
         with ExitStack() as stack:
             udp = stack.enter_context(open_udp())
+            if isinstance(options.flies, Orders):
+                # Its ports are always the same; the companion's socket stays where it is.
+                enter_own_network()
             autopilot = Flown(options, start, udp, stack)
             serve(autopilot, udp, autopilot.wire.socket)
 

@@ -28,6 +28,7 @@ from typing import Any, TextIO
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from sitl.autopilots.ardupilot_parameters import VISION_ALONE
 from sitl.autopilots.attitude_source import (
     AttitudeErrors,
     AttitudeSource,
@@ -38,7 +39,6 @@ from sitl.autopilots.fusing import Fusing, VisionPose
 from sitl.autopilots.hearing import Hearing, datagrams
 from sitl.autopilots.speaking import Backlog, packed
 from sitl.autopilots.steered import open_udp, run_steered, serve
-from sitl.autopilots.vision_parameters import VISION_ALONE
 from vcl_companion.daemon.scheduling import run_before_others
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.rotation import Array, euler_from_matrix, matrix_from_quaternion
@@ -139,6 +139,10 @@ class StandIn:
             dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: self._send_position,
         }
         self.n_times_told = 0
+
+    def state(self, at_ns: int) -> dict[str, object]:
+        """Return nothing: it does not fly by itself."""
+        return {}
 
     def advance_to(self, until_ns: int) -> int:
         """Send what is due up to an instant of the recording; return the time it is then."""

@@ -4,7 +4,10 @@
     stdin  {"advance_to_ns": t}     send what is due up to t
     stdout {"at_ns": t, "times_told": n}
                                     all of it has been handed to the kernel; n
-                                    TIMESYNC questions answered so far
+                                    TIMESYNC questions answered so far; of one that
+                                    flies by itself "pose" [x, y, z, qw, qx, qy, qz],
+                                    ned_from_body then, "mission", how far it has come,
+                                    "is_over" and "trouble" as well
     stdin  {"finish": true}         write what was heard and end
 
 The end of stdin ends it as well.
@@ -34,6 +37,10 @@ class Steered(Protocol):
 
     def advance_to(self, until_ns: int) -> int:
         """Send what is due up to an instant of the recording; return the time it is then."""
+        ...
+
+    def state(self, at_ns: int) -> Mapping[str, object]:
+        """Return what else there is to say of the instant that it was moved on to last."""
         ...
 
     def receive(self) -> None:
@@ -107,12 +114,13 @@ def run_steered(name: str, arguments: list[str], run: Callable[[Path], None]) ->
     return 0
 
 
-def _obey(autopilot: Steered, command: Mapping[str, object]) -> dict[str, int] | None:
+def _obey(autopilot: Steered, command: Mapping[str, object]) -> dict[str, object] | None:
     """Carry out one control line; return the answer, None at the end."""
     match command:
         case {"advance_to_ns": int(at_ns)}:
             now_ns = autopilot.advance_to(at_ns)
-            return {"at_ns": now_ns, "times_told": autopilot.n_times_told}
+            told = {"at_ns": now_ns, "times_told": autopilot.n_times_told}
+            return {**told, **autopilot.state(now_ns)}
         case {"finish": True}:
             return None
     raise ConfigError(f"control: unknown command {json.dumps(command)}")
@@ -128,6 +136,6 @@ def _command(line: bytes) -> Mapping[str, object]:
     return command
 
 
-def _say(answer: Mapping[str, int]) -> None:
+def _say(answer: Mapping[str, object]) -> None:
     sys.stdout.write(json.dumps(answer) + "\n")
     sys.stdout.flush()

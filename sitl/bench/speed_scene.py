@@ -10,7 +10,6 @@ import numpy as np
 from sitl.renderer import Renderer
 from sitl.scenario import DroneInScenario, Scenario
 from sitl.town import build_town
-from sitl.trajectories import FlightPath
 from sitl.world import World
 from vcl_companion.errors import RecordingError
 from vcl_companion.geometry.camera import Camera
@@ -103,7 +102,7 @@ class Scene:
             scenario = msgspec.structs.replace(scenario, camera=lens)
         self.scenario = scenario
         self.world = world or build_town(scenario.world)
-        self._paths = [FlightPath(drone.flight) for drone in scenario.drone]
+        self._paths = [drone.path() for drone in scenario.drone]
         start = self._paths[0].at(0.0).ned_from_body
         self._origin = start.translation
 

@@ -119,10 +119,10 @@ def test_a_wrong_configuration_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "ardupilot.json"
     path.write_text(json.dumps({"binary": "/bin/true"}))
     with pytest.raises(ConfigError, match="key 'attitude' is missing"):
-        read_options(path, {})
+        read_options(path)
     path.write_text("{")
     with pytest.raises(ConfigError, match=r"ardupilot\.json"):
-        read_options(path, {})
+        read_options(path)
 
 
 def test_what_a_firmware_was_never_sent_it_has_not_fused(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sitl.renderer import Imaging, Renderer
 from sitl.scenario import Scenario, load_scenario
 from sitl.town import Town, build_town
-from sitl.trajectories import FlightPath, Motion
+from sitl.trajectories import Motion
 from sitl.world import World
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
@@ -68,14 +68,13 @@ def world(name: str) -> World:
 
 
 def motion(name: str, drone: str, at_s: float) -> Motion:
-    flight = next(d.flight for d in scenario(name).drone if d.name == drone)
-    return FlightPath(flight).at(at_s)
+    return next(d.path() for d in scenario(name).drone if d.name == drone).at(at_s)
 
 
 @cache
 def flown(name: str, drone: str) -> Flown:
     times = np.arange(0.0, scenario(name).duration_s + 1e-9, _STEP_S)
-    path = FlightPath(next(d.flight for d in scenario(name).drone if d.name == drone))
+    path = next(d.path() for d in scenario(name).drone if d.name == drone)
     motions = [path.at(float(t)) for t in times]
     rotations = np.array([m.ned_from_body.rotation for m in motions])
     return Flown(

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sitl.autopilots.ardupilot import PARAMETERS, ArduCopter
+from sitl.autopilots.ardupilot import start
+from sitl.autopilots.ardupilot_parameters import RECORDED
 from sitl.autopilots.firmware_options import FirmwareOptions
 from sitl.autopilots.flown import Flown
 from sitl.autopilots.motion import RecordedMotion
@@ -98,12 +99,12 @@ def flown(tmp_path: Path, scenario: Callable[[Flight, Path], Coroutine[None, Non
     true = motion()
     out = tmp_path / "mav1"
     options = FirmwareOptions(
-        Path(_BINARY), SYSTEM, START_NS - BOOTED_BEFORE_NS, true, PARAMETERS, 0.0, out,
+        Path(_BINARY), SYSTEM, START_NS - BOOTED_BEFORE_NS, true, RECORDED, 0.0, out,
         tmp_path / "firmware",
     )  # fmt: skip
     with ExitStack() as stack:
         udp = stack.enter_context(open_udp())
-        autopilot = Flown(options, ArduCopter, udp, stack)
+        autopilot = Flown(options, start, udp, stack)
         autopilot.advance_to(START_NS)
 
         async def run() -> None:

@@ -11,7 +11,6 @@ import pytest
 from sitl.renderer import Imaging, Renderer
 from sitl.scenario import load_scenario
 from sitl.town import build_town
-from sitl.trajectories import FlightPath
 from sitl.world import SKY, Grey, Surface, Texture, World
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
@@ -224,7 +223,7 @@ def test_the_demo_town_is_rich_and_its_corners_are_found_again(demo_world: World
     detector = cv2.AKAZE.create()
     found, depth = [], []
     for i in (0, 1):
-        path = FlightPath(scenario.drone[i].flight)
+        path = scenario.drone[i].path()
         world_from_cam = path.at(0.0).ned_from_body @ sensor.body_from_cam
         renderer = Renderer(demo_world, sensor.camera, scenario.image.imaging(1.0))
         image = renderer.render(world_from_cam, np.random.default_rng(i))

@@ -189,7 +189,7 @@ def test_a_rendered_scenario_reads_back_and_is_the_same_every_time(tmp_path: Pat
         assert drone.truth is not None
         assert len(drone.truth) == 11  # five a frame, 20 Hz, and the last
         for frame in drone.frames:
-            motion = FlightPath(told_by.flight).at(scenario.flight_s(frame.at_ns))
+            motion = told_by.path().at(scenario.flight_s(frame.at_ns))
             pose = drone.truth.pose_at(frame.at_ns)
             assert pose is not None
             assert pose.matrix() == pytest.approx(motion.ned_from_body.matrix(), abs=1e-9)
@@ -211,7 +211,7 @@ def test_the_committed_recording_is_the_demo_and_small(demo: Recording) -> None:
     assert [len(drone.frames) for drone in demo.drones] == [60, 60, 60]
     assert sum(p.stat().st_size for p in DEMO.rglob("*") if p.is_file()) < 8_000_000
     for drone, told in zip(demo.drones, scenario.drone, strict=True):
-        path = FlightPath(told.flight)
+        path = told.path()
         assert drone.truth is not None
         for k, (at_ns, pose) in enumerate(drone.truth.stamped_poses()):
             motion = path.at(scenario.flight_s(at_ns))

@@ -138,8 +138,8 @@ class RecordingWriter:
         """Give a drone's ground truth when it is known only after its frames."""
         self._drones[name].truth = truth
 
-    def add_frame(self, name: str, at_ns: int, image: NDArray[np.uint8]) -> None:
-        """Encode and keep one image.
+    def add_frame(self, name: str, at_ns: int, image: NDArray[np.uint8]) -> bytes:
+        """Encode and keep one image; return its encoded form.
 
         Args:
             name: of a drone that was added.
@@ -158,9 +158,11 @@ class RecordingWriter:
         )
         if not encoded_well:
             raise ValueError(f"{name}: OpenCV cannot encode {target.name}")
+        data = encoded.tobytes()
         with self._disk():
-            target.write_bytes(encoded.tobytes())
+            target.write_bytes(data)
         drone.rows.append((at_ns, target.name))
+        return data
 
     def add_file(self, name: str, at_ns: int, source: Path) -> None:
         """Keep a JPEG or PNG file as it is (importers).

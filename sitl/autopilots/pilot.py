@@ -1,0 +1,241 @@
+"""Who flies a mission: what a person at a ground station would command an ArduCopter, by MAVLink.
+
+Arm, take off, go to one place after the other in GUIDED mode, land; each command is given again
+until the firmware does as told. Places are those of the firmware's own local frame, as far from
+where it believed to stand when it was armed as the mission says.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import ExitStack
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from sitl.autopilots.firmware_options import Orders
+from sitl.mission import COMMANDED_FILE, HOME_ALTITUDE_M, HOME_DEG, LANDED, STANDS
+from vcl_companion.geometry.rotation import Array
+
+_GUIDED, _LAND = 4, 9
+_SAYS_AGAIN_NS = 500_000_000
+_THERE_M, _THERE_M_S, _THERE_RAD = 0.3, 0.3, 0.1
+# To whom it takes so much longer than a leg should, something is wrong.
+_PATIENCE, _PATIENCE_S = 3.0, 20.0
+_ARMS_WITHIN_S = 60.0
+_POSITION_AND_YAW = 0b100111111000
+_FORCE_NONE = 0.0
+
+
+class Phase(Enum):
+    """How far a mission has come."""
+
+    WAITING = "waits"
+    ARMING = "arms"
+    CLIMBING = "takes off"
+    UNDER_WAY = "under way"
+    LANDING = "lands"
+    OVER = "over"
+
+
+class Pilot:
+    """Commands one vehicle.
+
+    Args:
+        orders: what it is to do, and when it is to arm.
+        system_id: the vehicle's.
+        send: takes a message to the firmware.
+        out: where every place commanded, and the end, are written down (``sitl.mission``).
+        stack: closes that.
+
+    Attributes:
+        phase: how far it has come.
+        trouble: why it was broken off; empty while it is not.
+    """
+
+    def __init__(
+        self,
+        orders: Orders,
+        system_id: int,
+        send: Callable[[Any], None],
+        out: Path,
+        stack: ExitStack,
+    ) -> None:
+        mission = orders.mission
+
+        self.phase = Phase.WAITING if mission.legs else Phase.OVER
+        self.trouble = ""
+        self._mission = mission
+        self._system_id = system_id
+        self._begins_ns = orders.begins_ns
+        self._send = send
+        self._commanded = stack.enter_context((out / COMMANDED_FILE).open("w", buffering=1))
+        self._commanded.write("at_ns,x,y,z,what\n")
+        self._places = mission.places() if mission.legs else np.zeros((0, 3))
+        self._next = 0
+        self._stood: Array = np.zeros(3)
+        self._target: Array = np.zeros(3)
+        self._position: Array | None = None
+        self._goes_to: Array = np.full(3, np.inf)
+        self._speed_m_s = 0.0
+        self._yaw_rad = 0.0
+        self._mode = -1
+        self._is_armed = False
+        self._said_at_ns = 0
+        self._gives_up_ns = 0
+
+    @property
+    def says(self) -> str:
+        """How far it has come, for people."""
+        if self.phase is Phase.UNDER_WAY:
+            return self._leg()
+        return self.trouble or self.phase.value
+
+    def _leg(self) -> str:
+        return f"leg {self._next + 1} of {len(self._places)}"
+
+    def hear(self, message: Any) -> None:
+        """Take in what the firmware says."""
+        match message.get_type():
+            case "HEARTBEAT":
+                self._mode = message.custom_mode
+                self._is_armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+            case "LOCAL_POSITION_NED":
+                self._position = np.array([message.x, message.y, message.z])
+                self._speed_m_s = math.hypot(message.vx, message.vy, message.vz)
+            case "POSITION_TARGET_LOCAL_NED":
+                self._goes_to = np.array([message.x, message.y, message.z])
+            case "ATTITUDE_QUATERNION":
+                w, x, y, z = message.q1, message.q2, message.q3, message.q4
+                self._yaw_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+    def go_on(self, now_ns: int) -> None:
+        """Do what is to be done at an instant."""
+        match self.phase:
+            case Phase.WAITING:
+                if now_ns >= self._begins_ns and self._position is not None:
+                    self._enter(Phase.ARMING, now_ns, _ARMS_WITHIN_S)
+            case Phase.ARMING:
+                if self._is_armed and self._position is not None:
+                    self._stood = self._position
+                    self._note(now_ns, self._stood, STANDS)
+                    self._to_climb(now_ns)
+            case Phase.CLIMBING:
+                if self._is_there():
+                    self._to_leg(0, now_ns)
+            case Phase.UNDER_WAY:
+                if self._is_there() and self._looks_there():
+                    self._to_leg(self._next + 1, now_ns)
+            case Phase.LANDING:
+                if not self._is_armed:
+                    self._end(now_ns, self.trouble)
+            case Phase.OVER:
+                return
+        self._mind(now_ns)
+        if now_ns >= self._said_at_ns + _SAYS_AGAIN_NS:
+            self._said_at_ns = now_ns
+            self._say()
+
+    def _mind(self, now_ns: int) -> None:
+        """Break off what the firmware does not do, or does not let be done any more."""
+        if self.phase in (Phase.CLIMBING, Phase.UNDER_WAY):
+            if not self._is_armed:
+                self._end(now_ns, f"disarmed: {self.says}")
+            elif self._mode not in (_GUIDED, -1):
+                self._break_off(f"left GUIDED for mode {self._mode}: {self.says}", now_ns)
+            elif now_ns > self._gives_up_ns:
+                self._break_off(f"did not arrive: {self.says}", now_ns)
+        elif self.phase is not Phase.WAITING and now_ns > self._gives_up_ns:
+            self._end(now_ns, self.trouble or f"did not do as told: {self.phase.value}")
+
+    def _end(self, now_ns: int, trouble: str) -> None:
+        self.trouble, self.phase = trouble, Phase.OVER
+        self._note(now_ns, self._target, trouble or LANDED)
+
+    def _break_off(self, why: str, now_ns: int) -> None:
+        self.trouble = why
+        self._enter(Phase.LANDING, now_ns, self._patience_s(self._height_m()))
+
+    def _enter(self, phase: Phase, now_ns: int, within_s: float) -> None:
+        self.phase = phase
+        self._said_at_ns = now_ns - _SAYS_AGAIN_NS
+        self._gives_up_ns = now_ns + round(within_s * 1e9)
+
+    def _to_climb(self, now_ns: int) -> None:
+        self._target = self._stood + np.array([0.0, 0.0, self._places[0][2]])
+        self._note(now_ns, self._target, Phase.CLIMBING.value)
+        self._enter(Phase.CLIMBING, now_ns, self._patience_s(-self._places[0][2]))
+
+    def _to_leg(self, number: int, now_ns: int) -> None:
+        if number == len(self._places):
+            self._target = np.array([*self._target[:2], self._stood[2]])
+            self._note(now_ns, self._target, Phase.LANDING.value)
+            self._enter(Phase.LANDING, now_ns, self._patience_s(self._height_m()))
+            return
+        before, self._target = self._target, self._stood + self._places[number]
+        self._next = number
+        self._note(now_ns, self._target, self._leg())
+        way_m = float(np.linalg.norm(self._target - before))
+        self._enter(Phase.UNDER_WAY, now_ns, self._patience_s(way_m))
+
+    def _patience_s(self, way_m: float) -> float:
+        # It climbs and sinks at its own pace, half a metre a second at the least.
+        return _PATIENCE_S + _PATIENCE * way_m / min(0.5, self._mission.speed_m_s)
+
+    def _height_m(self) -> float:
+        return 0.0 if self._position is None else float(self._stood[2] - self._position[2])
+
+    def _is_there(self) -> bool:
+        if self._position is None or self._speed_m_s > _THERE_M_S:
+            return False
+        return float(np.linalg.norm(self._position - self._target)) < _THERE_M
+
+    def _looks_there(self) -> bool:
+        off = self._yaw_rad - math.radians(self._mission.legs[self._next][3])
+        return abs(math.remainder(off, 2 * math.pi)) < _THERE_RAD
+
+    def _say(self) -> None:
+        """Command what is to be done now."""
+        match self.phase:
+            case Phase.ARMING:
+                lat_deg, lon_deg = HOME_DEG
+                self._send(
+                    dialect.MAVLink_set_gps_global_origin_message(
+                        self._system_id, round(lat_deg * 1e7), round(lon_deg * 1e7),
+                        round(HOME_ALTITUDE_M * 1e3), 0,
+                    )
+                )  # fmt: skip
+                self._change_mode(_GUIDED)
+                self._command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 1.0, _FORCE_NONE)
+            case Phase.CLIMBING:
+                if self._height_m() < 0.3:
+                    height_m = -float(self._places[0][2])
+                    self._command(dialect.MAV_CMD_NAV_TAKEOFF, *[0.0] * 6, height_m)
+            case Phase.UNDER_WAY:
+                if np.abs(self._goes_to - self._target).max() < _THERE_M:
+                    return  # told again, it would begin the way again, from rest
+                yaw_rad = math.radians(self._mission.legs[self._next][3])
+                self._send(
+                    dialect.MAVLink_set_position_target_local_ned_message(
+                        0, self._system_id, 1, dialect.MAV_FRAME_LOCAL_NED, _POSITION_AND_YAW,
+                        *self._target.tolist(), 0, 0, 0, 0, 0, 0, yaw_rad, 0,
+                    )
+                )  # fmt: skip
+            case Phase.LANDING:
+                self._change_mode(_LAND)
+
+    def _change_mode(self, mode: int) -> None:
+        custom = float(dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
+        self._command(dialect.MAV_CMD_DO_SET_MODE, custom, float(mode))
+
+    def _command(self, command: int, *parameters: float) -> None:
+        seven = [*parameters, *[0.0] * (7 - len(parameters))]
+        self._send(dialect.MAVLink_command_long_message(self._system_id, 1, command, 0, *seven))
+
+    def _note(self, at_ns: int, place: Array, what: str) -> None:
+        values = ",".join(repr(float(v)) for v in place)
+        self._commanded.write(f"{at_ns},{values},{what}\n")

@@ -1,0 +1,133 @@
+"""A real ArduCopter flies a mission by its own physics, and has no position but ours.
+
+Runs when ``VCL_ARDUPILOT`` names a binary built for simulation.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from sitl.mission import COMMANDED_FILE, Mission
+from sitl.processes import end_children, start_child
+from sitl.stand_in_process import StandIn
+from vcl_companion.clock import ManualClock
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.autopilot_options import AutopilotOptions
+from vcl_companion.links.vision_pose import PoseEstimate
+
+_BINARY = os.environ.get("VCL_ARDUPILOT", "")
+pytestmark = pytest.mark.skipif(not _BINARY, reason="VCL_ARDUPILOT names no arducopter")
+
+SYSTEM = 3
+START_NS = 1_000_000_000_000
+BOOTED_BEFORE_NS = 40_000_000_000
+STEP_NS, PERIOD_NS = 20_000_000, 100_000_000
+MISSION = Mission(
+    (7.0, -3.0, 30.0),
+    ((7.0, -3.0, -2.5, 30.0), (11.0, -3.0, -2.5, 30.0), (11.0, 1.0, -3.0, 90.0)),
+    begins_s=3.0,
+)
+
+
+class Companion:
+    """Our link to the firmware, which is told where it truly is."""
+
+    def __init__(self, autopilot: StandIn) -> None:
+        self.clock = ManualClock(START_NS)
+        options = AutopilotOptions(link=f"udp:127.0.0.1:{autopilot.port}")
+        self.link = AutopilotLink(options, SYSTEM, self.clock)
+        self.autopilot = autopilot
+        self.true: list[Pose] = []
+
+    async def fly(self, seconds: float, silent_after_s: float = np.inf) -> None:
+        until_ns = START_NS + round(seconds * 1e9)
+        while self.clock.now_ns() < until_ns and not self.autopilot.state.get("is_over"):
+            now_ns = self.clock.now_ns() + STEP_NS
+            await self.autopilot.advance_to(now_ns)
+            self.clock.advance_to(now_ns)
+            values = np.array(self.autopilot.state["pose"])
+            self.true.append(Pose.from_quaternion(values[3:], values[:3]))
+            is_told = now_ns < START_NS + silent_after_s * 1e9
+            if now_ns % PERIOD_NS == 0 and is_told:
+                self._tell(now_ns)
+            await asyncio.sleep(0.001)
+
+    def _tell(self, at_ns: int) -> None:
+        start = MISSION.ned_from_body.translation
+        told = Pose(self.true[-1].rotation, self.true[-1].translation - start)
+        covariance = np.diag([0.02**2] * 3 + [1e-4] * 3)
+        estimate = PoseEstimate(told, covariance, np.zeros(3), 0.01 * np.eye(3), at_ns, 0)
+        assert self.link.send_pose(estimate) is None
+
+
+async def flown(tmp_path: Path, seconds: float, silent_after_s: float = np.inf) -> Companion:
+    config = {
+        "binary": _BINARY,
+        "system_id": SYSTEM,
+        "boot_offset_ns": START_NS - BOOTED_BEFORE_NS,
+        "mission": msgspec.to_builtins(MISSION),
+        "begins_ns": START_NS + round(MISSION.begins_s * 1e9),
+        "out": str(tmp_path / "out"),
+        "run": str(tmp_path / "run"),
+    }
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(config))
+    child = await start_child(
+        "autopilot",
+        (sys.executable, "-m", "sitl.autopilots.ardupilot", str(path)),
+        log_prefix=tmp_path / "autopilot",
+        environment={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        piped=True,
+    )
+    try:
+        companion = Companion(await StandIn.of(child))
+        await companion.autopilot.advance_to(START_NS)
+        async with asyncio.timeout(300.0):
+            link = asyncio.ensure_future(companion.link.run())
+            try:
+                await companion.fly(seconds, silent_after_s)
+            finally:
+                link.cancel()
+        await companion.autopilot.finish()
+    finally:
+        await end_children([child], 5.0)
+    return companion
+
+
+def test_it_arms_takes_off_goes_where_it_is_sent_and_lands_there(tmp_path: Path) -> None:
+    companion = asyncio.run(flown(tmp_path, 90.0))
+    state = companion.autopilot.state
+    said = (tmp_path / "out" / "said.csv").read_text()
+    assert (state["is_over"], state["trouble"]) == (True, ""), said
+    ended = companion.true[-1].translation
+    assert np.linalg.norm(ended[:2] - (11.0, 1.0)) < 0.3
+    assert abs(ended[2] + MISSION.gear_m) < 0.05
+    highest = min(pose.translation[2] for pose in companion.true)
+    assert -3.4 < highest < -2.9
+    commanded = (tmp_path / "out" / COMMANDED_FILE).read_text().splitlines()
+    steps = [line.rsplit(",", 1)[1] for line in commanded[1:]]
+    assert steps == [
+        "stands",
+        "takes off",
+        *(f"leg {n} of 3" for n in (1, 2, 3)),
+        "lands",
+        "landed",
+    ]
+
+
+def test_where_we_fall_silent_it_gives_up_its_mission_and_lands_by_itself(tmp_path: Path) -> None:
+    companion = asyncio.run(flown(tmp_path, 90.0, silent_after_s=12.0))
+    state = companion.autopilot.state
+    said = (tmp_path / "out" / "said.csv").read_text()
+    assert state["is_over"], said
+    assert "left GUIDED" in state["trouble"], said
+    assert abs(companion.true[-1].translation[2] + MISSION.gear_m) < 0.1
