@@ -206,7 +206,6 @@ class Flown:
             for wanted, interval_us in (
                 (dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, _STREAM_US),
                 (dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, _STREAM_US),
-                (dialect.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED, _ESTIMATOR_US),
                 (self._firmware.estimator_message, _ESTIMATOR_US),
             ):
                 messages.append(

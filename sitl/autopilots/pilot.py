@@ -1,8 +1,9 @@
 """Who flies a mission: what a person at a ground station would command an ArduCopter, by MAVLink.
 
 Arm, take off, go to one place after the other in GUIDED mode, land; each command is given again
-until the firmware does as told. Places are those of the firmware's own local frame, as far from
-where it believed to stand when it was armed as the mission says.
+until the firmware does as told. Places and headings are those of the firmware's own local frame,
+as far from where and how it believed to stand when it was armed as the mission says: where a
+firmware has its heading from vision, its north is whatever that calls north.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sitl.autopilots.firmware_options import Orders
 from sitl.mission import COMMANDED_FILE, HOME_ALTITUDE_M, HOME_DEG, LANDED, STANDS
-from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.rotation import Array, matrix_from_euler
 
 _GUIDED, _LAND = 4, 9
 _SAYS_AGAIN_NS = 500_000_000
+_SETS_OUT_WITHIN_NS = 2_000_000_000
 _THERE_M, _THERE_M_S, _THERE_RAD = 0.3, 0.3, 0.1
 # To whom it takes so much longer than a leg should, something is wrong.
 _PATIENCE, _PATIENCE_S = 3.0, 20.0
@@ -76,16 +78,16 @@ class Pilot:
         self._commanded = stack.enter_context((out / COMMANDED_FILE).open("w", buffering=1))
         self._commanded.write("at_ns,x,y,z,what\n")
         self._places = mission.places() if mission.legs else np.zeros((0, 3))
+        self._yaws_rad = [math.radians(leg[3]) for leg in mission.legs]
         self._next = 0
         self._stood: Array = np.zeros(3)
         self._target: Array = np.zeros(3)
         self._position: Array | None = None
-        self._goes_to: Array = np.full(3, np.inf)
         self._speed_m_s = 0.0
         self._yaw_rad = 0.0
         self._mode = -1
         self._is_armed = False
-        self._said_at_ns = 0
+        self._says_again_ns = 0
         self._gives_up_ns = 0
 
     @property
@@ -107,8 +109,6 @@ class Pilot:
             case "LOCAL_POSITION_NED":
                 self._position = np.array([message.x, message.y, message.z])
                 self._speed_m_s = math.hypot(message.vx, message.vy, message.vz)
-            case "POSITION_TARGET_LOCAL_NED":
-                self._goes_to = np.array([message.x, message.y, message.z])
             case "ATTITUDE_QUATERNION":
                 w, x, y, z = message.q1, message.q2, message.q3, message.q4
                 self._yaw_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -122,6 +122,7 @@ class Pilot:
             case Phase.ARMING:
                 if self._is_armed and self._position is not None:
                     self._stood = self._position
+                    self._turn_mission(self._yaw_rad - math.radians(self._mission.stands[2]))
                     self._note(now_ns, self._stood, STANDS)
                     self._to_climb(now_ns)
             case Phase.CLIMBING:
@@ -136,9 +137,13 @@ class Pilot:
             case Phase.OVER:
                 return
         self._mind(now_ns)
-        if now_ns >= self._said_at_ns + _SAYS_AGAIN_NS:
-            self._said_at_ns = now_ns
+        if now_ns >= self._says_again_ns:
+            self._says_again_ns = now_ns + _SAYS_AGAIN_NS
             self._say()
+
+    def _turn_mission(self, turn_rad: float) -> None:
+        self._places = self._places @ matrix_from_euler(0.0, 0.0, turn_rad).T
+        self._yaws_rad = [yaw_rad + turn_rad for yaw_rad in self._yaws_rad]
 
     def _mind(self, now_ns: int) -> None:
         """Break off what the firmware does not do, or does not let be done any more."""
@@ -162,7 +167,7 @@ class Pilot:
 
     def _enter(self, phase: Phase, now_ns: int, within_s: float) -> None:
         self.phase = phase
-        self._said_at_ns = now_ns - _SAYS_AGAIN_NS
+        self._says_again_ns = now_ns
         self._gives_up_ns = now_ns + round(within_s * 1e9)
 
     def _to_climb(self, now_ns: int) -> None:
@@ -195,8 +200,8 @@ class Pilot:
         return float(np.linalg.norm(self._position - self._target)) < _THERE_M
 
     def _looks_there(self) -> bool:
-        off = self._yaw_rad - math.radians(self._mission.legs[self._next][3])
-        return abs(math.remainder(off, 2 * math.pi)) < _THERE_RAD
+        off_rad = self._yaw_rad - self._yaws_rad[self._next]
+        return abs(math.remainder(off_rad, 2 * math.pi)) < _THERE_RAD
 
     def _say(self) -> None:
         """Command what is to be done now."""
@@ -216,13 +221,14 @@ class Pilot:
                     height_m = -float(self._places[0][2])
                     self._command(dialect.MAV_CMD_NAV_TAKEOFF, *[0.0] * 6, height_m)
             case Phase.UNDER_WAY:
-                if np.abs(self._goes_to - self._target).max() < _THERE_M:
-                    return  # told again, it would begin the way again, from rest
-                yaw_rad = math.radians(self._mission.legs[self._next][3])
+                # Told again, it would begin its way anew, from rest.
+                self._says_again_ns += _SETS_OUT_WITHIN_NS
+                if self._speed_m_s > _THERE_M_S:
+                    return
                 self._send(
                     dialect.MAVLink_set_position_target_local_ned_message(
                         0, self._system_id, 1, dialect.MAV_FRAME_LOCAL_NED, _POSITION_AND_YAW,
-                        *self._target.tolist(), 0, 0, 0, 0, 0, 0, yaw_rad, 0,
+                        *self._target.tolist(), 0, 0, 0, 0, 0, 0, self._yaws_rad[self._next], 0,
                     )
                 )  # fmt: skip
             case Phase.LANDING:

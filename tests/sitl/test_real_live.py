@@ -20,6 +20,7 @@ from sitl.processes import end_children, start_child
 from sitl.stand_in_process import StandIn
 from vcl_companion.clock import ManualClock
 from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import matrix_from_euler
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.vision_pose import PoseEstimate
@@ -35,6 +36,12 @@ MISSION = Mission(
     (7.0, -3.0, 30.0),
     ((7.0, -3.0, -2.5, 30.0), (11.0, -3.0, -2.5, 30.0), (11.0, 1.0, -3.0, 90.0)),
     begins_s=3.0,
+)
+
+
+# Its local frame begins where it stands, and its north is some way from the true one.
+LOCAL_FROM_NED = Pose(matrix_from_euler(0.0, 0.0, -0.6), np.zeros(3)) @ Pose(
+    np.eye(3), -MISSION.ned_from_body.translation
 )
 
 
@@ -62,8 +69,7 @@ class Companion:
             await asyncio.sleep(0.001)
 
     def _tell(self, at_ns: int) -> None:
-        start = MISSION.ned_from_body.translation
-        told = Pose(self.true[-1].rotation, self.true[-1].translation - start)
+        told = LOCAL_FROM_NED @ self.true[-1]
         covariance = np.diag([0.02**2] * 3 + [1e-4] * 3)
         estimate = PoseEstimate(told, covariance, np.zeros(3), 0.01 * np.eye(3), at_ns, 0)
         assert self.link.send_pose(estimate) is None
@@ -125,7 +131,7 @@ def test_it_arms_takes_off_goes_where_it_is_sent_and_lands_there(tmp_path: Path)
 
 
 def test_where_we_fall_silent_it_gives_up_its_mission_and_lands_by_itself(tmp_path: Path) -> None:
-    companion = asyncio.run(flown(tmp_path, 90.0, silent_after_s=12.0))
+    companion = asyncio.run(flown(tmp_path, 90.0, silent_after_s=9.0))
     state = companion.autopilot.state
     said = (tmp_path / "out" / "said.csv").read_text()
     assert state["is_over"], said
