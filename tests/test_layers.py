@@ -34,6 +34,7 @@ HEIGHT = {room: height for height, shelf in enumerate(SHELVES) for room in shelf
 CONFINED = {
     "pymavlink": (
         f"{PACKAGE}/links/mavlink.py",
+        f"{PACKAGE}/links/own_messages.py",
         f"{PACKAGE}/links/signing.py",
         "sitl/autopilots/",
         "tests/",

@@ -36,10 +36,12 @@ class Autopilot(asyncio.DatagramProtocol):
         self._transport: asyncio.DatagramTransport | None = None
         self._companion: Any = None
         self._parts: list[bytes] = []
+        self._asked_last = (0, 0)
         self.texts: asyncio.Queue[str] = asyncio.Queue()
         self.states: asyncio.Queue[int] = asyncio.Queue()
         self.answers: asyncio.Queue[tuple[int, int, int]] = asyncio.Queue()
         self.poses: asyncio.Queue[tuple[Any, ...]] = asyncio.Queue()
+        self.others: asyncio.Queue[wire.Seen] = asyncio.Queue()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.DatagramTransport, transport)
@@ -59,24 +61,39 @@ class Autopilot(asyncio.DatagramProtocol):
                     self._take_text(*seen.fields)
                 case wire.COMMAND_ACK:
                     command, result, progress, _, system, component = seen.fields
-                    assert (system, component) == (255, 190)
+                    assert (system, component) == self._asked_last
                     self.answers.put_nowait((command, result, progress))
                 case wire.VISION_POSITION_ESTIMATE:
                     self.poses.put_nowait(seen.fields)
+                case wire.TIMESYNC | wire.COMMAND_LONG:
+                    pass
+                case _:
+                    self.others.put_nowait(seen)
 
     def forward(
         self,
         command: int,
         parameter: float = 0.0,
+        second: float = 0.0,
         *,
         confirmation: int = 0,
         target: int | None = None,
+        component: int = 197,
         system: int = 255,
     ) -> None:
         """Hand on a ground station's command."""
         to = self._system_id if target is None else target
-        fields = (parameter, *[0.0] * 6, command, to, 197, confirmation)
+        self._asked_last = (system, 190)
+        fields = (parameter, second, *[0.0] * 5, command, to, component, confirmation)
         self._say(wire.packed(wire.COMMAND_LONG, *fields, system=system, component=190))
+
+    def hand_on(self, message_id: int, *fields: float | bytes, system: int = 255) -> None:
+        """Hand on another message of a ground station, its fields in wire order."""
+        self._say(wire.packed(message_id, *fields, system=system, component=190))
+
+    def said_texts(self) -> list[str]:
+        """Take the texts that have come so far."""
+        return [self.texts.get_nowait() for _ in range(self.texts.qsize())]
 
     def measure(self, at_ns: int, quaternion: Array) -> None:
         """Turn, and send that attitude as one of an instant of the companion's time."""

@@ -29,6 +29,10 @@ from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.message_requests import MessageRequests
+from vcl_companion.daemon.onboard_computer import OnboardComputer
+from vcl_companion.daemon.saved_map import SavedMap
+from vcl_companion.daemon.settings import open_settings
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.links.autopilot import AutopilotLink
@@ -83,13 +87,14 @@ class Drone:
         inter: InterMavOptions,
         update: UpdateOptions,
         seed: int,
+        directory: str = "",
     ) -> None:
         self.system_id = system_id
         self.autopilot, self.autopilot_link = autopilot
         self.clock = clock
         self._log_path = log_path
         self.log = FlightLog(str(log_path), clock)
-        self.maps = MapStore("")
+        self.maps = MapStore(directory)
         self.requests: list[FrameRequest] = []
         self.estimator = Estimator(
             FilterOptions(), LocalizationOptions(), lambda why: self.log.event("jump", why)
@@ -110,12 +115,26 @@ class Drone:
             clock, self.exchange.clocks.answered, open_signing(peers),
         )  # fmt: skip
         self.exchange.attach(self._link)
-        Commands(self.autopilot_link, self.exchange, self.maps, self.estimator, self.log)
+        self.saved = SavedMap(
+            self.maps, self.exchange.go_back_to, self.estimator, executor, self.autopilot_link,
+            self.log,
+        )  # fmt: skip
+        self.computer = OnboardComputer(log_path.parent)
+        self.messages = MessageRequests(self.autopilot_link, self.computer, executor)
+        commands = Commands(
+            self.autopilot_link, self.exchange, self.maps, self.estimator, self.saved,
+            self.messages, self.log,
+        )  # fmt: skip
+        self.parameters = open_settings(
+            self.autopilot_link, self.exchange, commands.pause, self.log
+        )
 
     async def run(self) -> None:
         async with asyncio.TaskGroup() as parts:
-            for part in (self.autopilot_link, self._link, self.exchange):
+            for part in (self.autopilot_link, self._link, self.messages, self.parameters):
                 parts.create_task(part.run())
+            await self.saved.begin()
+            parts.create_task(self.exchange.run())
 
     def close(self) -> None:
         self.work.end()
@@ -334,9 +353,12 @@ class Swarm:
         inter: InterMavOptions = INTER,
         update: UpdateOptions = NO_UPDATES,
         runs: bool = True,
+        directory: str = "",
     ) -> Drone:
         """Start a drone that only talks, and sees what the test says it sees; see ``_start``."""
-        return await self._start(Drone, system_id, flies_on, transfer, inter, update, runs)
+        return await self._start(
+            Drone, system_id, flies_on, transfer, inter, update, runs, directory
+        )
 
     async def fly(
         self,
@@ -344,9 +366,12 @@ class Swarm:
         flies_on: tuple[int, ...] = (),
         transfer: TransferOptions = FAST,
         update: UpdateOptions = NO_UPDATES,
+        directory: str = "",
     ) -> Flyer:
         """Start a drone that flies; see ``_start``."""
-        return await self._start(Flyer, system_id, flies_on, transfer, INTER, update, True)
+        return await self._start(
+            Flyer, system_id, flies_on, transfer, INTER, update, True, directory
+        )
 
     async def _start(
         self,
@@ -357,6 +382,7 @@ class Swarm:
         inter: InterMavOptions,
         update: UpdateOptions,
         runs: bool,
+        directory: str,
     ) -> _Kind:
         """Start a drone at the instant of its first frame, flying on the map of some if given."""
         life = await self._stack.enter_async_context(contextlib.AsyncExitStack())
@@ -372,7 +398,7 @@ class Swarm:
         log_path = self._path / f"{system_id}-{self._n_started}.jsonl"
         drone = kind(
             system_id, self._members, self._peers(system_id), autopilot, clock, executor,
-            log_path, transfer, inter, update, self._n_started,
+            log_path, transfer, inter, update, self._n_started, directory,
         )  # fmt: skip
         life.callback(drone.close)
         if flies_on:

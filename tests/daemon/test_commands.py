@@ -10,7 +10,7 @@ from tests.daemon.swarm import Drone, swarm
 from tests.daemon.waiting import computed, passes, passes_until, run, until
 from vcl_companion.swarm.updates import UpdateOptions
 
-UPDATE_MAP, RELOCALIZE, PAUSE = 31010, 31013, 31014
+UPDATE_MAP, SAVE, RELOAD, RELOCALIZE, PAUSE = range(31010, 31015)
 ACCEPTED, BUSY, DENIED, UNSUPPORTED, FAILED, IN_PROGRESS, CANCELLED = range(7)
 QUIET = UpdateOptions(tracked=0, share=0.0)
 
@@ -80,7 +80,9 @@ def test_what_cannot_be_done_is_answered(tmp_path: Path) -> None:
             await one.see(demo.frame(1, 0))
             for command, parameter, result in (
                 (UPDATE_MAP, 0.0, BUSY),  # there is no map
-                (31011, 0.0, UNSUPPORTED),
+                (SAVE, 0.0, DENIED),  # there is nowhere to
+                (RELOAD, 0.0, DENIED),
+                (31009, 0.0, UNSUPPORTED),
                 (400, 1.0, UNSUPPORTED),  # arm
                 (PAUSE, 0.5, DENIED),
                 (UPDATE_MAP, 2.0, DENIED),
@@ -88,6 +90,11 @@ def test_what_cannot_be_done_is_answered(tmp_path: Path) -> None:
             ):
                 one.autopilot.forward(command, parameter)
                 assert (await last_answer(one))[:2] == (command, result)
+            assert "VCL map not saved: [map] directory is not set" in one.autopilot.said_texts()
+            one.autopilot.forward(31009, component=0)  # all are asked: not ours to refuse
+            one.autopilot.forward(31009)
+            assert await last_answer(one) == (31009, UNSUPPORTED, 255)
+            assert one.autopilot.answers.empty()
 
     run(scenario())
 
@@ -124,7 +131,7 @@ def test_poses_are_held_back_until_they_are_wanted_again(tmp_path: Path) -> None
             await one.fly(4)
             outcomes = [(line["outcome"], line["reason"]) for line in one.lines("frame")]
             assert outcomes[-2:] == [("refused", "paused by the ground"), ("localized", None)]
-            texts = [one.autopilot.texts.get_nowait() for _ in range(one.autopilot.texts.qsize())]
+            texts = one.autopilot.said_texts()
             assert "VCL no poses are sent, as commanded" in texts
             assert "VCL poses are sent again, as commanded" in texts
 
@@ -142,5 +149,31 @@ def test_who_is_told_to_relocalize_looks_for_itself_anew(tmp_path: Path) -> None
             assert not one.estimator.is_localized(one.clock.now_ns())
             await one.fly(2)
             assert one.estimator.is_localized(one.clock.now_ns())
+
+    run(scenario())
+
+
+def test_a_command_whose_answer_was_lost_is_not_obeyed_again(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            one = await members.start(1, update=QUIET)
+            await one.see(demo.frame(1, 0))
+            for confirmation, n_obeyed in ((0, 1), (1, 1), (2, 1), (0, 2)):
+                one.autopilot.forward(RELOCALIZE, confirmation=confirmation)
+                assert await last_answer(one) == (RELOCALIZE, ACCEPTED, 255)
+                assert len(one.events("command")) == n_obeyed
+            # Of somebody else, or for something else, or long ago, it is another one.
+            one.autopilot.forward(RELOCALIZE, confirmation=1, system=1)
+            assert await last_answer(one) == (RELOCALIZE, ACCEPTED, 255)
+            assert len(one.events("command")) == 3
+            one.autopilot.forward(PAUSE, 1.0, confirmation=3)
+            assert await last_answer(one) == (PAUSE, ACCEPTED, 255)
+            one.autopilot.forward(PAUSE, 0.0, confirmation=1)
+            assert await last_answer(one) == (PAUSE, ACCEPTED, 255)
+            assert not one.autopilot_link.is_paused
+            await passes(3.0)
+            one.autopilot.forward(PAUSE, 0.0, confirmation=1)
+            assert await last_answer(one) == (PAUSE, ACCEPTED, 255)
+            assert len(one.events("command")) == 6
 
     run(scenario())

@@ -6,7 +6,8 @@ from typing import Any
 
 # message id: CRC_EXTRA, https://mavlink.io/en/messages/ardupilotmega.html
 HEARTBEAT, ATTITUDE, ATTITUDE_QUATERNION, COMMAND_LONG, COMMAND_ACK = 0, 30, 31, 76, 77
-PARAM_REQUEST_READ, PARAM_VALUE, PARAM_SET = 20, 22, 23
+PARAM_REQUEST_READ, PARAM_REQUEST_LIST, PARAM_VALUE, PARAM_SET = 20, 21, 22, 23
+AUTOPILOT_VERSION, MESSAGE_INTERVAL, ONBOARD_COMPUTER_STATUS = 148, 244, 390
 VISION_POSITION_ESTIMATE, TIMESYNC, STATUSTEXT, ODOMETRY, TUNNEL = 102, 111, 253, 331, 385
 CRC_EXTRA = {
     HEARTBEAT: 50,
@@ -14,6 +15,7 @@ CRC_EXTRA = {
     ATTITUDE_QUATERNION: 246,
     COMMAND_LONG: 152,
     PARAM_REQUEST_READ: 214,
+    PARAM_REQUEST_LIST: 159,
     PARAM_VALUE: 220,
     PARAM_SET: 168,
     COMMAND_ACK: 143,
@@ -22,6 +24,9 @@ CRC_EXTRA = {
     STATUSTEXT: 83,
     ODOMETRY: 91,
     TUNNEL: 147,
+    AUTOPILOT_VERSION: 178,
+    MESSAGE_INTERVAL: 95,
+    ONBOARD_COMPUTER_STATUS: 156,
 }
 # Fields on the wire stand by falling size, extensions last.
 LAYOUT = {
@@ -30,6 +35,7 @@ LAYOUT = {
     ATTITUDE_QUATERNION: struct.Struct("<I7f4f"),
     COMMAND_LONG: struct.Struct("<7fHBBB"),
     PARAM_REQUEST_READ: struct.Struct("<hBB16s"),
+    PARAM_REQUEST_LIST: struct.Struct("<BB"),
     PARAM_VALUE: struct.Struct("<4sHH16sB"),
     PARAM_SET: struct.Struct("<4sBB16sB"),
     COMMAND_ACK: struct.Struct("<HBBiBB"),
@@ -39,6 +45,12 @@ LAYOUT = {
     # usec xyz q v rates 21 of the pose 21 of the twist frame child reset estimator quality
     ODOMETRY: struct.Struct("<Q3f4f3f3f21f21fBBBBb"),
     TUNNEL: struct.Struct("<HBBB128s"),
+    # capabilities uid flight middleware os board vendor product, three customs, a longer uid
+    AUTOPILOT_VERSION: struct.Struct("<QQIIIIHH8s8s8s18s"),
+    MESSAGE_INTERVAL: struct.Struct("<iH"),
+    # usec uptime ram(2) storage(4 types, 4 used, 4 in all) links(6 each of type tx rx txmax rxmax)
+    # fans(4) type cores(8) combined(10) gpus(4) combined(10) board core(8)
+    ONBOARD_COMPUTER_STATUS: struct.Struct("<QI2I12I30I4hB8B10B4B10Bb8b"),
 }
 
 

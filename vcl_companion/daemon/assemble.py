@@ -30,7 +30,11 @@ from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.message_requests import MessageRequests
+from vcl_companion.daemon.onboard_computer import OnboardComputer
+from vcl_companion.daemon.saved_map import SavedMap
 from vcl_companion.daemon.scheduling import run_before_others
+from vcl_companion.daemon.settings import open_settings
 from vcl_companion.daemon.status_writer import StatusWriter
 from vcl_companion.daemon.usage import (
     cpu_s,
@@ -221,8 +225,16 @@ async def _run(config: Config) -> int:
         disk,
     )
     exchange.attach(peers)
-    Commands(autopilot, exchange, maps, estimator, log)
-    watching = [health.run()]
+    saved = SavedMap(maps, exchange.go_back_to, estimator, disk, autopilot, log)
+    requests = MessageRequests(autopilot, OnboardComputer(Path()), disk)
+    commands = Commands(autopilot, exchange, maps, estimator, saved, requests, log)
+    parameters = open_settings(autopilot, exchange, commands.pause, log)
+
+    async def exchanging() -> None:
+        await saved.begin()  # before anybody makes a first map
+        await exchange.run()
+
+    watching = [health.run(), requests.run(), parameters.run()]
     if config.log.status_file:
         status = StatusWriter(
             Path(config.log.status_file),
@@ -235,7 +247,7 @@ async def _run(config: Config) -> int:
             ended,
             autopilot.run(),
             peers.run(),
-            exchange.run(),
+            exchanging(),
             companion.run(),
             *watching,
             ends_all=companion.read_camera(),

@@ -453,6 +453,19 @@ class Exchange:
         self._own_state.is_asked_for_update = self._rounds.is_asked = wanted
 
     @property
+    def update_options(self) -> UpdateOptions:
+        """When we want the map updated; changing them changes our vote, and nobody else's."""
+        return self._own_state.update_options
+
+    @update_options.setter
+    def update_options(self, options: UpdateOptions) -> None:
+        self._own_state.update_options = options
+
+    async def go_back_to(self, data: bytes) -> str:
+        """Fly on a map that was saved; return why it cannot be used, or nothing."""
+        return await self._sharing.go_back_to(data)
+
+    @property
     def update_progress(self) -> int:
         """How far the update is that this drone makes, percent; 255 where it makes none."""
         return self._rounds.progress

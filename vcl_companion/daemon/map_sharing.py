@@ -268,6 +268,29 @@ class MapSharing:
             await self._install(ready)
         return None
 
+    async def go_back_to(self, data: bytes) -> str:
+        """Fly on a map that was saved; return why it cannot be used, or nothing.
+
+        Not on one of another world than ours, which poses that are under way are in.
+        """
+        try:
+            offer = MapOffer.of(BlobKind.MAP, data)
+        except WireError as error:
+            return str(error)
+        current = self._maps.current
+        if current is not None and current.revision == offer.revision:
+            return ""
+        ready = await self._prepared(offer)
+        if isinstance(ready, NoMap):
+            return ready.reason
+        current = self._maps.current
+        new = ready.index.landmark_map
+        if current is not None and way_into(current, new, offer.revision) is not None:
+            return "it is of another world than the map in use"
+        self._branches.given_by(self._group.own_id)
+        await self._install(ready)
+        return ""
+
     def _why_not(self, peer: int, offer: MapOffer) -> str | None:
         """Return why we do not fly on a peer's map, or None if we do.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 import os
 import tempfile
@@ -19,6 +20,9 @@ from vcl_companion.wire.map_codec import revision_of
 _log = logging.getLogger(__name__)
 
 _MAX_LEFT = 256  # revisions remembered by name
+_SAVED = "saved.vclmap"
+# Several times the longest of maps; a file that is longer is something else.
+_MAX_FILE_BYTES = 64 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +78,8 @@ class MapStore:
     were left are known by name.
 
     Args:
-        directory: where every revision is kept as ``<revision>.vclmap``; empty for nowhere.
+        directory: where every revision is kept as ``<revision>.vclmap``, and the one to begin
+            with as ``saved.vclmap``; empty for nowhere.
 
     Raises:
         ConfigError: the directory cannot be made, or no file in it.
@@ -174,14 +179,69 @@ class MapStore:
         if self._directory is None:
             return
         path = self._directory / f"{stored.revision.hex()}.vclmap"
-        partial = path.with_suffix(".partial")
         try:
-            with open(partial, "wb") as file:
-                file.write(stored.data)
-                file.flush()
-                os.fsync(file.fileno())
-            partial.replace(path)
+            _write_whole(path, stored.data)
         except OSError as error:
             _log.error("the map %s cannot be kept: %s", path, error.strerror)
-            with suppress(OSError):
-                partial.unlink()
+
+    @property
+    def saved_file(self) -> Path | None:
+        """The map to begin with after a restart, if there is one; None without a directory."""
+        return None if self._directory is None else self._directory / _SAVED
+
+    def save(self, stored: StoredMap) -> None:
+        """Write a revision down to begin with, in the place of any other; any thread may.
+
+        Raises:
+            OSError: it cannot be written; what was there stays.
+        """
+        if self.saved_file is not None:
+            _write_whole(self.saved_file, stored.data)
+
+    def saved(self) -> bytes:
+        """Return the encoded map to begin with; nothing is known of its bytes. Any thread may.
+
+        Raises:
+            OSError: it cannot be read; FileNotFoundError: there is none.
+        """
+        if self.saved_file is None:
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+        with self.saved_file.open("rb") as file:
+            data = file.read(_MAX_FILE_BYTES + 1)
+        if len(data) > _MAX_FILE_BYTES:
+            raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+        return data
+
+    def forget_saved(self) -> None:
+        """Begin with no map after a restart; any thread may.
+
+        Raises:
+            OSError: the file cannot be removed.
+        """
+        if self.saved_file is not None:
+            self.saved_file.unlink(missing_ok=True)
+
+
+def _write_whole(path: Path, data: bytes) -> None:
+    """Put a file on the disk, whole or not at all.
+
+    Raises:
+        OSError: that has failed.
+    """
+    partial = path.with_suffix(".partial")
+    try:
+        with open(partial, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except OSError:
+        with suppress(OSError):
+            partial.unlink()
+        raise
+    # Its name is not on the disk before that of its folder is.
+    descriptor = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

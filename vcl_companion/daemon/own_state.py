@@ -59,6 +59,15 @@ class OwnState:
         self._told_at_s = float("-inf")
         self._told_lead = (0, 0)
 
+    @property
+    def update_options(self) -> UpdateOptions:
+        """What our vote goes by from the next look on."""
+        return self._vote.options
+
+    @update_options.setter
+    def update_options(self, options: UpdateOptions) -> None:
+        self._vote.options = options
+
     def joined(self) -> None:
         """Note that somebody came who does not know our state."""
         self._has_joined = True

@@ -44,7 +44,7 @@ def peak_resident_mb() -> float:
     small process started by a large one claims the large one's.
     """
     with suppress(OSError, ValueError, KeyError):
-        return _kilobytes("self/status")["VmHWM:"] / 1024
+        return kilobytes("self/status")["VmHWM:"] / 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
@@ -63,16 +63,20 @@ def usage_of(forked_pid: int) -> Usage:
         # The name may hold blanks and brackets: what follows its last bracket counts.
         told = (_PROC / f"{forked_pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
         ticks = int(told[11]) + int(told[12])
-        peak = _kilobytes(f"{forked_pid}/status")["VmHWM:"]
-        pages = _kilobytes(f"{forked_pid}/smaps_rollup")
+        peak = kilobytes(f"{forked_pid}/status")["VmHWM:"]
+        pages = kilobytes(f"{forked_pid}/smaps_rollup")
         shared = pages["Shared_Clean:"] + pages["Shared_Dirty:"]
         return Usage(ticks / os.sysconf("SC_CLK_TCK"), (peak - shared) / 1024)
     return Usage()
 
 
-def _kilobytes(file: str) -> dict[str, int]:
-    """Read the lines "Key: value kB" of a file of the kernel's."""
-    lines = (_PROC / file).read_text(encoding="utf-8").splitlines()
+def kilobytes(file: str, proc: Path = _PROC) -> dict[str, int]:
+    """Read the lines "Key: value kB" of a file of the kernel's.
+
+    Raises:
+        OSError, ValueError: there is none, or it is no text.
+    """
+    lines = (proc / file).read_text(encoding="utf-8").splitlines()
     fields = [line.split() for line in lines]
     return {f[0]: int(f[1]) for f in fields if len(f) == 3 and f[2] == "kB"}
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -25,8 +27,10 @@ from vcl_companion.links.messages import (
     FRAME_LOCAL_FRD,
     FRAME_LOCAL_NED,
     LOCAL_POSITION_ID,
+    ODOMETRY_ID,
     RESULT_ACCEPTED,
     SET_MESSAGE_INTERVAL,
+    VISION_POSITION_ESTIMATE_ID,
     AttitudeSample,
     CommandAck,
     CommandLong,
@@ -34,6 +38,8 @@ from vcl_companion.links.messages import (
     Heartbeat,
     LocalPosition,
     Message,
+    ParameterOrder,
+    ParameterSet,
     ParameterValue,
     Timesync,
 )
@@ -55,6 +61,8 @@ _SYNC_ENOUGH = 8
 _SYNC_GIVEN_UP = 10
 # How far back estimators fuse: EKF2_DELAY_MAX; VISO_DELAY_MS goes up to 0.25.
 _REMEMBERS_S = 0.2
+# Poses were sent for as long as the last one is no older; how often, the last ten say.
+_POSES_LAST_S, _POSES_COUNTED = 1.0, 10
 # 0 is what an autopilot that has heard of none takes for known.
 _RESETS = 255
 _FIRMWARE = {"ardupilot": Firmware.ARDUPILOT, "px4": Firmware.PX4}
@@ -81,6 +89,9 @@ class AutopilotLink:
         self.is_paused = False
         """Whether poses are held back, as the ground has commanded."""
         self.on_command: Callable[[CommandLong], None] | None = None
+        self.on_parameter: Callable[[ParameterOrder], None] | None = None
+        """Shown who asks for a parameter of ours, or sets one; only ground systems may set."""
+        self._sent_at_s: deque[float] = deque(maxlen=_POSES_COUNTED)
         self._parameters = Parameters(self._read_parameter, self._write_parameter)
         self._fusion = FusionMonitor()
         self._sync = TimesyncEstimator()
@@ -90,6 +101,30 @@ class AutopilotLink:
         self._firmware = _FIRMWARE.get(options.profile, Firmware.OTHER)
         self._streams.firmware = self._firmware
         self._first_reset: int | None = None
+
+    @property
+    def options(self) -> AutopilotOptions:
+        """How the autopilot is told; ``max_pose_age_s`` and ``time_error_s`` may be changed."""
+        return self._options
+
+    @options.setter
+    def options(self, options: AutopilotOptions) -> None:
+        self._options = options
+
+    @property
+    def pose_message_id(self) -> int:
+        """In which message poses are sent."""
+        by_vision = self._options.message == "vision_position_estimate"
+        return VISION_POSITION_ESTIMATE_ID if by_vision else ODOMETRY_ID
+
+    @property
+    def pose_interval_s(self) -> float | None:
+        """From one pose that was sent to the next, s; None when none goes out now."""
+        now_s = asyncio.get_running_loop().time()
+        sent = self._sent_at_s
+        if len(sent) < 2 or now_s - sent[-1] > _POSES_LAST_S:
+            return None
+        return (sent[-1] - sent[0]) / (len(sent) - 1)
 
     @property
     def counters(self) -> LinkCounters:
@@ -126,6 +161,20 @@ class AutopilotLink:
                 message.command, result, progress, message.sender_system, message.sender_component
             )
         )
+
+    def send(self, message: Any) -> None:
+        """Send one of ``own_messages``."""
+        self._transport.write(self._codec.frame(message))
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether we have no heartbeat."""
+        return self._state is ServiceState.STALLED
+
+    def send_heartbeat(self) -> None:
+        """Send a HEARTBEAT at once, unless we have none."""
+        if not self.is_silent:
+            self._transport.write(self._codec.heartbeat(self._state.value))
 
     async def parameter(self, name: str) -> float | None:
         """Return one of the autopilot's parameters; None when it has none of the name."""
@@ -215,6 +264,7 @@ class AutopilotLink:
                 reset_counter,
             )
         self._transport.write(frame)
+        self._sent_at_s.append(asyncio.get_running_loop().time())
         sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0))
         self._fusion.sent(estimate.at_ns, pose.translation, sigma_m)
         return None
@@ -260,6 +310,8 @@ class AutopilotLink:
         for message in self._codec.decode(data, is_stream=self._transport.is_stream):
             if isinstance(message, CommandLong):
                 self._take_command(message)
+            elif isinstance(message, ParameterOrder):
+                self._take_parameter_order(message)
             elif message.sender_system != self._system_id:
                 self._tally.refuse("another system")
             elif message.sender_component != COMPONENT_AUTOPILOT:
@@ -308,6 +360,19 @@ class AutopilotLink:
         elif self.on_command is not None:
             self.on_command(message)
 
+    def _take_parameter_order(self, message: ParameterOrder) -> None:
+        """Hand on who asks for our parameters; anybody aboard may look, the ground may set."""
+        may = self._options.ground_systems
+        if not isinstance(message, ParameterSet):
+            may = (*may, self._system_id)
+        for_us = message.target_system in (0, self._system_id)
+        if not for_us or message.target_component not in (0, COMPONENT_COMPANION):
+            self._tally.refuse("a parameter of somebody else")
+        elif message.sender_system not in may:
+            self._tally.refuse("a parameter for a stranger")
+        elif self.on_parameter is not None:
+            self.on_parameter(message)
+
     def _take_position(self, message: LocalPosition) -> None:
         offset_ns = self._offset_ns(self._clock.now_ns())
         if offset_ns is not None:
@@ -345,20 +410,16 @@ class AutopilotLink:
 
     def _greet(self) -> None:
         """Make ourselves known on a link that has just come up."""
-        self._beat()
+        self.send_heartbeat()
         if self._clock.now_ns() > 0:
             self._ask_if_due(0.0)
         self._streams.ask_for_all()
         self._texts.say_again()
 
-    def _beat(self) -> None:
-        if self._state is not ServiceState.STALLED:
-            self._transport.write(self._codec.heartbeat(self._state.value))
-
     async def _heartbeats(self) -> None:
         while True:
             await asyncio.sleep(_HEARTBEAT_S)
-            self._beat()
+            self.send_heartbeat()
 
     async def _questions(self) -> None:
         while True:

@@ -34,7 +34,8 @@ class AutopilotOptions:
             ``auto``: whose the autopilot's HEARTBEAT says it is; ``plain``: as it is.
         message: in which poses are sent: ``vision_position_estimate``, or ``odometry``, which
             holds the velocity as well.
-        ground_systems: MAVLink systems whose commands are obeyed: ground stations.
+        ground_systems: MAVLink systems whose commands are obeyed, and who may change settings:
+            ground stations.
         max_pose_age_s: a pose of a frame older than this is not sent.
         time_error_s: how well the autopilot knows the instant of a pose, 1 sigma: what it is
             told is uncertain by so much of the way.

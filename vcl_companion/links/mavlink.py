@@ -1,4 +1,4 @@
-"""MAVLink 2: bytes to typed messages and back; the only module that knows pymavlink.
+"""MAVLink 2: bytes to typed messages and back, by pymavlink.
 
 Frame, little endian (https://mavlink.io/en/guide/serialization.html):
 
@@ -204,6 +204,10 @@ class Codec:
         checksum = int(dialect.x25crc(body + bytes([crc_extra])).crc)
         whole = frame[:1] + body + checksum.to_bytes(_CHECKSUM_BYTES, "little")
         return whole + signing.trailer(whole, self._now())
+
+    def frame(self, message: Any) -> bytes:
+        """Return the frame of a message that was made elsewhere (``own_messages``)."""
+        return self._pack(message)
 
     def heartbeat(self, system_status: int) -> bytes:
         """Return a companion's HEARTBEAT with a MAV_STATE."""

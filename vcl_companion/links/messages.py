@@ -11,14 +11,22 @@ COMPONENT_AUTOPILOT = 1
 COMPONENT_COMPANION = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 MAX_TUNNEL_BYTES = 128
 STATUS_TEXT_BYTES = 50
-SET_MESSAGE_INTERVAL = 511
+GET_MESSAGE_INTERVAL, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE = 510, 511, 512
+HEARTBEAT_ID = 0
 ATTITUDE_QUATERNION_ID = 31
 LOCAL_POSITION_ID = 32
+VISION_POSITION_ESTIMATE_ID = 102
+AUTOPILOT_VERSION_ID = 148
 EKF_STATUS_REPORT_ID = 193
 ESTIMATOR_STATUS_ID = 230
+MESSAGE_INTERVAL_ID = 244
+ODOMETRY_ID = 331
+ONBOARD_COMPUTER_STATUS_ID = 390
 RESULT_ACCEPTED, RESULT_TEMPORARILY_REJECTED, RESULT_DENIED, RESULT_UNSUPPORTED = 0, 1, 2, 3
 RESULT_FAILED, RESULT_IN_PROGRESS, RESULT_CANCELLED = 4, 5, 6
-UPDATE_MAP, RELOCALIZE, PAUSE_SENDING = 31010, 31013, 31014  # MAV_CMD_USER_1, 4, 5
+UPDATE_MAP, SAVE_MAP, RELOAD_MAP = 31010, 31011, 31012  # MAV_CMD_USER_1, 2, 3
+RELOCALIZE, PAUSE_SENDING = 31013, 31014  # MAV_CMD_USER_4, 5
+PARAMETER_REAL32 = 9  # MAV_PARAM_TYPE
 FRAME_LOCAL_NED, FRAME_LOCAL_FRD = 1, 20
 
 
@@ -167,3 +175,35 @@ class ParameterValue(Message):
     name: str
     raw: bytes
     kind: int
+
+
+@dataclass(frozen=True)
+class ParameterList(Message):
+    """Asks for all of our parameters; ``target_system`` and ``target_component`` 0 are all."""
+
+    target_system: int
+    target_component: int
+
+
+@dataclass(frozen=True)
+class ParameterRead(Message):
+    """Asks for one of them: by its name, or where ``index`` is not negative, by that."""
+
+    target_system: int
+    target_component: int
+    name: str
+    index: int
+
+
+@dataclass(frozen=True)
+class ParameterSet(Message):
+    """Sets one of them; the value is that of ``ParameterValue``."""
+
+    target_system: int
+    target_component: int
+    name: str
+    raw: bytes
+    kind: int
+
+
+ParameterOrder = ParameterList | ParameterRead | ParameterSet

@@ -20,6 +20,9 @@ from vcl_companion.links.messages import (
     Heartbeat,
     LocalPosition,
     Message,
+    ParameterList,
+    ParameterRead,
+    ParameterSet,
     ParameterValue,
     StatusText,
     Timesync,
@@ -27,7 +30,9 @@ from vcl_companion.links.messages import (
 )
 
 _HEAD_2 = 10
-_VALUE_BYTES = 4
+_VALUE_BYTES, _NAME_BYTES = 4, 16
+# Where the name begins in PARAM_REQUEST_READ, and in PARAM_SET
+_NAME_IN_READ, _NAME_IN_SET = 4, 6
 _QUATERNION_NORM_TOLERANCE = 0.05
 # The same bits in EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS
 _POSITION_RELATIVE, _POSITION_ABSOLUTE, _POSITION_CONSTANT = 0x8, 0x10, 0x80
@@ -47,9 +52,7 @@ def _heartbeat(m: Any, sender: _Sender) -> Message | str:
 
 
 def _timesync(m: Any, sender: _Sender) -> Message | str:
-    frame = m.get_msgbuf()
-    payload = bytes(frame[_HEAD_2 : _HEAD_2 + min(frame[1], TIMESYNC_LAYOUT.size)])
-    return Timesync(*sender, *TIMESYNC_LAYOUT.unpack(payload.ljust(TIMESYNC_LAYOUT.size, b"\0")))
+    return Timesync(*sender, *TIMESYNC_LAYOUT.unpack(_payload(m, TIMESYNC_LAYOUT.size)))
 
 
 def _attitude(m: Any, sender: _Sender) -> Message | str:
@@ -102,9 +105,38 @@ def _tunnel(m: Any, sender: _Sender) -> Message | str:
 def _parameter_value(m: Any, sender: _Sender) -> Message | str:
     name = m.param_id if isinstance(m.param_id, str) else m.param_id.decode("ascii", "replace")
     # The value's bytes are an integer's for some: what they were as a float must not be lost.
+    return ParameterValue(*sender, name.rstrip("\0"), _payload(m, _VALUE_BYTES), m.param_type)
+
+
+def _parameter_list(m: Any, sender: _Sender) -> Message | str:
+    return ParameterList(*sender, m.target_system, m.target_component)
+
+
+def _parameter_read(m: Any, sender: _Sender) -> Message | str:
+    name = _name(m, _NAME_IN_READ)
+    if name is None:
+        return "parameter's name is no text"
+    return ParameterRead(*sender, m.target_system, m.target_component, name, m.param_index)
+
+
+def _parameter_set(m: Any, sender: _Sender) -> Message | str:
+    name = _name(m, _NAME_IN_SET)
+    if name is None:
+        return "parameter's name is no text"
+    raw = _payload(m, _VALUE_BYTES)
+    return ParameterSet(*sender, m.target_system, m.target_component, name, raw, m.param_type)
+
+
+def _name(m: Any, at: int) -> str | None:
+    """Return a parameter's name: up to 16 characters, or up to a zero; None if that is no ASCII."""
+    name = _payload(m, at + _NAME_BYTES)[at:].partition(b"\0")[0]
+    return name.decode("ascii") if name.isascii() else None
+
+
+def _payload(m: Any, n_bytes: int) -> bytes:
+    """Return the first bytes of a message's payload, with the zeros that were not sent."""
     frame = m.get_msgbuf()
-    raw = bytes(frame[_HEAD_2 : _HEAD_2 + min(frame[1], _VALUE_BYTES)]).ljust(_VALUE_BYTES, b"\0")
-    return ParameterValue(*sender, name.rstrip("\0"), raw, m.param_type)
+    return bytes(frame[_HEAD_2 : _HEAD_2 + min(frame[1], n_bytes)]).ljust(n_bytes, b"\0")
 
 
 def _status_text(m: Any, sender: _Sender) -> Message | str:
@@ -132,6 +164,9 @@ READERS: dict[str, Callable[[Any, _Sender], Message | str]] = {
     "ESTIMATOR_STATUS": _estimator_status,
     "LOCAL_POSITION_NED": _local_position,
     "PARAM_VALUE": _parameter_value,
+    "PARAM_REQUEST_LIST": _parameter_list,
+    "PARAM_REQUEST_READ": _parameter_read,
+    "PARAM_SET": _parameter_set,
     "TUNNEL": _tunnel,
     "STATUSTEXT": _status_text,
     "COMMAND_LONG": _command_long,

@@ -30,7 +30,7 @@ class MapOptions:
         max_landmarks: and at most this many landmarks.
         member_wait_s: how long a first map waits for members that are not there yet.
         gather_timeout_s: how long it waits for the frames of those that are.
-        directory: where revisions are kept; empty for nowhere.
+        directory: where revisions are kept, and the map to begin with; empty for nowhere.
     """
 
     detectors: tuple[Detector, ...] = ("akaze", "sift")

@@ -143,10 +143,14 @@ class Sight:
 
 
 class OwnVote:
-    """Whether this drone wants its map updated, by what it has seen of it lately."""
+    """Whether this drone wants its map updated, by what it has seen of it lately.
+
+    Attributes:
+        options: what it goes by; may be changed.
+    """
 
     def __init__(self, options: UpdateOptions) -> None:
-        self._options = options
+        self.options = options
         self._revision = b""
         self._seen: deque[tuple[float, Sight]] = deque()
         self._since_s = 0.0
@@ -177,7 +181,7 @@ class OwnVote:
         self._seen.append((now_s, sight))
         while self._seen[0][0] < now_s - _WINDOW_S:
             self._seen.popleft()
-        if not revision or not (self._options.tracked or self._options.share):
+        if not revision or not (self.options.tracked or self.options.share):
             self._wants = False
         elif now_s - self._since_s >= _JUDGED_SHARE * _WINDOW_S:
             self._wants = (
@@ -195,7 +199,7 @@ class OwnVote:
         seen = [(at_s, float(s.tracked)) for at_s, s in self._seen]
         lately = statistics.median_high(n for _, n in seen)
         self._most = max(self._most, lately)
-        least = max(self._options.tracked, self._options.share * self._most)
+        least = max(self.options.tracked, self.options.share * self._most)
         return min(lately, self._foreseen(seen, lately)) < least
 
     def _is_narrow(self) -> bool:
@@ -204,13 +208,13 @@ class OwnVote:
             return False
         lately = statistics.median_high(share for _, share in known)
         self._most_covered = max(self._most_covered, lately)
-        least = min(self._options.covered, _STILL_COVERED * self._most_covered)
+        least = min(self.options.covered, _STILL_COVERED * self._most_covered)
         return min(lately, self._foreseen(known, lately)) < least
 
     def _is_new(self) -> bool:
         seen = [(at_s, s.novelty_deg) for at_s, s in self._seen]
         lately_deg = statistics.median_low(novelty for _, novelty in seen)
-        return max(lately_deg, self._foreseen(seen, lately_deg)) > self._options.novelty_deg
+        return max(lately_deg, self._foreseen(seen, lately_deg)) > self.options.novelty_deg
 
     def _foreseen(self, values: list[tuple[float, float]], lately: float) -> float:
         """Return what a quantity will be if it goes on as it does, if it goes anywhere.
@@ -231,7 +235,7 @@ class OwnVote:
         steps = newest - between, between - oldest
         if steps[0] * steps[1] <= 0.0:
             return lately
-        return newest + min(steps, key=abs) * self._options.ahead_s / third_s
+        return newest + min(steps, key=abs) * self.options.ahead_s / third_s
 
     def _is_vague(self) -> bool:
         known = [s.sigma_m for _, s in self._seen if s.sigma_m is not None]
@@ -239,8 +243,8 @@ class OwnVote:
             return False
         lately_m = statistics.median_low(known)
         self._least_sigma_m = min(self._least_sigma_m, lately_m)
-        growth = self._options.sigma_growth
-        return lately_m > max(self._options.sigma_m, growth * self._least_sigma_m)
+        growth = self.options.sigma_growth
+        return lately_m > max(self.options.sigma_m, growth * self._least_sigma_m)
 
 
 class UpdateTrigger:
