@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from typing import Any, cast
 
 import numpy as np
@@ -36,7 +36,9 @@ class Autopilot(asyncio.DatagramProtocol):
         self._transport: asyncio.DatagramTransport | None = None
         self._companion: Any = None
         self._parts: list[bytes] = []
-        self._asked_last = (0, 0)
+        self._asked_last = (255, 190)
+        self.relay: Callable[[bytes], None] | None = None
+        """Shown all that the companion sends, as a ground station is."""
         self.texts: asyncio.Queue[str] = asyncio.Queue()
         self.states: asyncio.Queue[int] = asyncio.Queue()
         self.answers: asyncio.Queue[tuple[int, int, int]] = asyncio.Queue()
@@ -48,6 +50,8 @@ class Autopilot(asyncio.DatagramProtocol):
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         self._companion = addr
+        if self.relay is not None:
+            self.relay(data)
         for seen in wire.read(data):
             match seen.message_id:
                 case wire.TIMESYNC if seen.fields[0] == 0:
@@ -86,6 +90,10 @@ class Autopilot(asyncio.DatagramProtocol):
         self._asked_last = (system, 190)
         fields = (parameter, second, *[0.0] * 5, command, to, component, confirmation)
         self._say(wire.packed(wire.COMMAND_LONG, *fields, system=system, component=190))
+
+    def pass_on(self, data: bytes) -> None:
+        """Hand on what a ground station sends, as it is."""
+        self._say(data)
 
     def hand_on(self, message_id: int, *fields: float | bytes, system: int = 255) -> None:
         """Hand on another message of a ground station, its fields in wire order."""

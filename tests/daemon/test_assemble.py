@@ -21,6 +21,7 @@ from sitl.daemon_config import toml_text
 from tests.daemon import demo
 from tests.ports import free_ports
 from vcl_companion.recording import Description, RecordingWriter
+from vcl_companion.wire.map_codec import revision_of
 from vcl_companion.wire.warm_up import warm_up
 
 ROOT = Path(__file__).parents[2]
@@ -138,6 +139,21 @@ def test_a_recording_ends_by_itself_and_a_service_manager_follows(
     assert summary["frames"] == {"localized": 0, "refused": N_FRAMES, "dropped": 0}
     reasons = {frame["reason"] for frame in alone.lines("frame")}
     assert all(reason.startswith("no map: ") for reason in reasons)
+
+
+def test_a_restart_flies_on_the_map_that_was_saved(tmp_path: Path) -> None:
+    saved = demo.encoded_map(1, 2)
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "maps" / "saved.vclmap").write_bytes(saved)
+    with daemon(tmp_path, recorded(demo.DEMO)) as again:
+        again.says("begins on the saved map")
+        again.says("localized")
+        again.process.terminate()
+        status, errors = again.end()
+    assert (status, "Traceback" in errors) == (0, False)
+    assert again.lines("map")[0]["revision"] == revision_of(saved).hex()
+    (summary,) = again.lines("summary")
+    assert summary["frames"]["localized"] > 0
 
 
 def test_sigterm_while_it_waits_for_its_camera(recording: Path, tmp_path: Path) -> None:

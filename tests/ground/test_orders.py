@@ -1,4 +1,4 @@
-"""The ground's order for a map update, against companions made by hand."""
+"""The ground's orders, against companions made by hand."""
 
 import asyncio
 from collections.abc import Sequence
@@ -11,9 +11,9 @@ from tests.links.running import Udp, running, udp
 from tests.ports import free_ports
 from vcl_companion.cli import main
 from vcl_companion.errors import DeviceError
-from vcl_companion.ground.map_update import MapUpdate, Told
+from vcl_companion.ground.orders import ORDERS, Ordering, Told
 
-UPDATE_MAP = 31010
+UPDATE_MAP, SAVE, RELOAD, RELOCALIZE, PAUSE = range(31010, 31015)
 ACCEPTED, BUSY, DENIED, UNSUPPORTED, FAILED, IN_PROGRESS, CANCELLED = range(7)
 
 
@@ -25,11 +25,21 @@ class Companion:
         system_id: whose.
         answers: result and progress of each, a twentieth of a second apart.
         loses: so many orders do not arrive.
+        command: what it is ordered.
+        says: texts before its answers, as severity, text, number and chunk of each.
     """
 
     def __init__(
-        self, side: Udp, system_id: int, answers: Sequence[tuple[int, int]], loses: int = 0
+        self,
+        side: Udp,
+        system_id: int,
+        answers: Sequence[tuple[int, int]],
+        loses: int,
+        command: int,
+        says: Sequence[tuple[int, bytes, int, int]],
     ) -> None:
+        self._command = command
+        self._says = says
         self._side = side
         self._system_id = system_id
         self._answers = answers
@@ -47,17 +57,21 @@ class Companion:
             for seen in wire.read(data):
                 if seen.message_id == wire.COMMAND_LONG and seen.fields[8] == self._system_id:
                     assert (seen.system, seen.component) == (255, 190)
-                    assert (seen.fields[7], seen.fields[9]) == (UPDATE_MAP, 197)
+                    assert (seen.fields[7], seen.fields[9]) == (self._command, 197)
                     await self._obey(seen.fields[0], seen.fields[10], ground)
 
     async def _obey(self, first: float, confirmation: int, ground: tuple[str, int]) -> None:
         self.orders.append((first, confirmation))
         if len(self.orders) <= self._loses:
             return
-        answers = self._answers if first == 0.0 else [(CANCELLED, 255)]
+        for text in self._says:
+            said = wire.packed(wire.STATUSTEXT, *text, system=self._system_id, component=197)
+            self._say(said, ground)
+        is_cancel = self._command == UPDATE_MAP and first == 1.0
+        answers = [(CANCELLED, 255)] if is_cancel else self._answers
         for result, progress in answers:
             answer = wire.packed(
-                wire.COMMAND_ACK, UPDATE_MAP, result, progress, 0, 255, 190,
+                wire.COMMAND_ACK, self._command, result, progress, 0, 255, 190,
                 system=self._system_id, component=197,
             )  # fmt: skip
             self._say(answer, ground)
@@ -71,18 +85,24 @@ async def ordered(
     *companions: tuple[int, Sequence[tuple[int, int]], int],
     drones: Sequence[int] = (),
     within_s: float = 8.0,
+    order: str = "update-map",
+    says: Sequence[tuple[int, bytes, int, int]] = (),
 ) -> tuple[bool, list[Told], list[Companion]]:
-    """Have companions, each over a link of its own, update their map; return what came of it."""
+    """Give companions, each over a link of its own, an order; return what came of it."""
     told: list[Told] = []
     ports = free_ports(len(companions))
     links = [f"udpin:127.0.0.1:{port}" for port in ports]
-    order = MapUpdate(links, drones, within_s, told.append)
+    ordering = Ordering(ORDERS[order], links, drones, within_s, told.append)
+    command = ORDERS[order].command
     async with udp() as one, udp() as two:
         sides = (one, two)[: len(companions)]
-        made = [Companion(side, *parts) for side, parts in zip(sides, companions, strict=True)]
+        made = [
+            Companion(side, *parts, command, says)
+            for side, parts in zip(sides, companions, strict=True)
+        ]
         grounds = [("127.0.0.1", port) for port in ports]
         async with running(*(c.run(at) for c, at in zip(made, grounds, strict=True))):
-            return await order.run(), told, made
+            return await ordering.run(), told, made
 
 
 def texts(told: list[Told], drone: int) -> list[str]:
@@ -128,14 +148,60 @@ def test_who_is_not_done_in_time_is_told_to_stop() -> None:
     assert one.orders[0] == (0.0, 0)
 
 
+@pytest.mark.parametrize(
+    ("order", "command", "parameter", "text"),
+    [
+        ("save-map", SAVE, 0.0, "has saved its map"),
+        ("forget-map", SAVE, 1.0, "begins without a map next time"),
+        ("reload-map", RELOAD, 0.0, "is back on its saved map"),
+        ("relocalize", RELOCALIZE, 0.0, "looks for where it is"),
+        ("pause", PAUSE, 1.0, "sends no poses"),
+        ("resume", PAUSE, 0.0, "sends poses again"),
+    ],
+)
+def test_each_order_is_its_command(order: str, command: int, parameter: float, text: str) -> None:
+    assert ORDERS[order].command == command
+    answers = [(IN_PROGRESS, 255), (ACCEPTED, 255)]
+    is_done, told, (one,) = asyncio.run(ordered((1, answers, 0), drones=[1], order=order))
+    assert is_done
+    assert texts(told, 1) == ["is at it", text]
+    assert one.orders == [(parameter, 0)]
+
+
+def test_what_cannot_be_taken_back_is_not() -> None:
+    is_done, told, (one,) = asyncio.run(
+        ordered((1, [(IN_PROGRESS, 255)], 0), drones=[1], within_s=1.0, order="save-map")
+    )
+    assert not is_done
+    assert texts(told, 1)[-1] == "is not done in time"
+    assert one.orders == [(0.0, 0)]
+
+
+def test_why_something_is_not_done_is_passed_on_from_the_drone() -> None:
+    says = [(3, b"VCL map not saved: No spa\x07ce left on dev".ljust(50, b"e"), 7, 0),
+            (3, b" ice", 7, 1), (6, b"VCL localized", 0, 0)]  # fmt: skip
+    is_done, told, _ = asyncio.run(
+        ordered((1, [(FAILED, 255)], 0), drones=[1], order="save-map", says=says)
+    )
+    assert not is_done
+    (text,) = texts(told, 1)
+    assert text.startswith("could not save it; it says: VCL map not saved: No space left on dev")
+    assert text.endswith("e ice")
+    is_done, told, _ = asyncio.run(
+        ordered((1, [(ACCEPTED, 255)], 0), drones=[1], order="save-map", says=says)
+    )
+    assert texts(told, 1) == ["has saved its map"]
+
+
 def test_who_is_not_heard_is_named() -> None:
     with pytest.raises(DeviceError, match="companion of 9 is not heard"):
         asyncio.run(ordered((1, [(ACCEPTED, 100)], 0), drones=[1, 9]))
 
 
-def test_nobody_there_is_one_line_and_status_2() -> None:
+@pytest.mark.parametrize("order", ["update-map", "save-map", "pause"])
+def test_nobody_there_is_one_line_and_status_2(order: str) -> None:
     (port,) = free_ports(1)
-    result = CliRunner().invoke(main, ["ground", "update-map", "--link", f"udpin:127.0.0.1:{port}"])
+    result = CliRunner().invoke(main, ["ground", order, "--link", f"udpin:127.0.0.1:{port}"])
     assert result.exit_code == 2
     assert "the companion of any drone is not heard" in result.output
     assert "Traceback" not in result.output
