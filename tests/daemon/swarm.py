@@ -125,9 +125,7 @@ class Drone:
             self.autopilot_link, self.exchange, self.maps, self.estimator, self.saved,
             self.messages, self.log,
         )  # fmt: skip
-        self.parameters = open_settings(
-            self.autopilot_link, self.exchange, commands.pause, self.log
-        )
+        self.parameters = open_settings(self.autopilot_link, self.exchange, commands, self.log)
 
     async def run(self) -> None:
         async with asyncio.TaskGroup() as parts:

@@ -177,3 +177,24 @@ def test_a_command_whose_answer_was_lost_is_not_obeyed_again(tmp_path: Path) -> 
             assert len(one.events("command")) == 6
 
     run(scenario())
+
+
+def test_no_numbers_of_a_command_do_harm(tmp_path: Path) -> None:
+    numbers = (float("nan"), float("inf"), -float("inf"), 3e38, -1.0, 0.25, -1e-40)
+    switches = (UPDATE_MAP, SAVE, PAUSE)
+
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            one = await members.start(1, update=QUIET, directory=str(tmp_path / "maps"))
+            await one.see(demo.frame(1, 0))
+            for command in (*switches, RELOAD, RELOCALIZE, 0, 400, 65535):
+                for number in numbers:
+                    for confirmation in (0, 255):
+                        one.autopilot.forward(command, number, number, confirmation=confirmation)
+                        answer = await last_answer(one)
+                        assert answer[0] == command
+                        assert command not in switches or answer[1] == DENIED
+            assert not one.autopilot_link.is_paused
+            assert list((tmp_path / "maps").iterdir()) == []
+
+    run(scenario())

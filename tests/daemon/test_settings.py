@@ -68,6 +68,15 @@ def test_poses_are_paused_and_judged_by_what_was_set(tmp_path: Path) -> None:
             assert await set_to(one, "VCL_PAUSED", 0.5) == 1.0
             assert await set_to(one, "VCL_PAUSED", 0.0) == 0.0
             assert not one.autopilot_link.is_paused
+            assert one.autopilot.said_texts() == [
+                "VCL no poses are sent, as commanded",
+                "VCL_PAUSED: must be 0 or 1, got 0.5",
+                "VCL poses are sent again, as commanded",
+            ]
+            for paused in (1.0, 0.0):  # by MAV_CMD_USER_5
+                one.autopilot.forward(31014, paused)
+                assert await told(one) == ("VCL_PAUSED", paused)
+            one.autopilot.said_texts()
             assert await set_to(one, "VCL_TIME_ERR", 0.1) == pytest.approx(0.1)
             assert await set_to(one, "VCL_POSE_AGE", 0.05) == pytest.approx(0.05)
             assert await set_to(one, "VCL_POSE_AGE", 10.5) == pytest.approx(0.05)
@@ -78,9 +87,6 @@ def test_poses_are_paused_and_judged_by_what_was_set(tmp_path: Path) -> None:
                 "VCL_TIME_ERR 0.1, by system 255", "VCL_POSE_AGE 0.05, by system 255",
             ]  # fmt: skip
             assert one.autopilot.said_texts() == [
-                "VCL no poses are sent, as commanded",
-                "VCL_PAUSED: must be 0 or 1, got 0.5",
-                "VCL poses are sent again, as commanded",
                 "VCL_POSE_AGE: max_pose_age_s: must be in 0.05..10, got 10.5",
             ]
 

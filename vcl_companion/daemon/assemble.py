@@ -228,7 +228,7 @@ async def _run(config: Config) -> int:
     saved = SavedMap(maps, exchange.go_back_to, estimator, disk, autopilot, log)
     requests = MessageRequests(autopilot, OnboardComputer(Path()), disk)
     commands = Commands(autopilot, exchange, maps, estimator, saved, requests, log)
-    parameters = open_settings(autopilot, exchange, commands.pause, log)
+    parameters = open_settings(autopilot, exchange, commands, log)
 
     async def exchanging() -> None:
         await saved.begin()  # before anybody makes a first map

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 
 from vcl_companion.daemon.estimator import Estimator
@@ -109,6 +109,8 @@ class Commands:
         self._storing: asyncio.Task[None] | None = None
         self._stores = (0, 0.0)  # the command and the parameter of that
         self._ended: dict[int, _Ended] = {}
+        self.on_pause: Callable[[], None] | None = None
+        """Called when a command has held poses back, or sent them again."""
         autopilot.on_command = self.take
 
     def take(self, message: CommandLong) -> None:
@@ -134,6 +136,8 @@ class Commands:
         elif command == PAUSE_SENDING:
             self._note(message, "send no poses" if first else "send poses again")
             self.pause(is_paused=first == 1.0)
+            if self.on_pause is not None:
+                self.on_pause()
             self._answer(message, RESULT_ACCEPTED)
         elif command in self._requests.commands:
             self._request(message)

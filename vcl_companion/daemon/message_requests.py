@@ -65,6 +65,8 @@ class MessageRequests:
         self._autopilot = autopilot
         self._computer = computer
         self._disk = disk
+        # Looked up on the disk, and so not when somebody asks.
+        self._version = autopilot_version(_own_version())
         self._interval_s: float | None = _DEFAULT_S
         self._is_wanted = False
         self._news = asyncio.Event()
@@ -109,8 +111,7 @@ class MessageRequests:
                 return RESULT_TEMPORARILY_REJECTED, None
             return RESULT_ACCEPTED, self._autopilot.send_heartbeat
         if message_id == AUTOPILOT_VERSION_ID:
-            version = autopilot_version(_own_version())
-            return RESULT_ACCEPTED, lambda: self._autopilot.send(version)
+            return RESULT_ACCEPTED, lambda: self._autopilot.send(self._version)
         if message_id == ONBOARD_COMPUTER_STATUS_ID:
             return RESULT_ACCEPTED, self._want_status
         if message_id == self._autopilot.pose_message_id:

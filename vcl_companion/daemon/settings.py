@@ -22,6 +22,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from vcl_companion.daemon.commands import Commands
 from vcl_companion.daemon.exchange import Exchange
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.links.autopilot import AutopilotLink
@@ -31,6 +32,7 @@ from vcl_companion.links.texts import Severity
 
 _log = logging.getLogger(__name__)
 
+_PAUSED = "VCL_PAUSED"
 _POSES = {"VCL_POSE_AGE": "max_pose_age_s", "VCL_TIME_ERR": "time_error_s"}
 _UPDATES = {
     "VCL_UPD_TRACKED": "tracked",
@@ -46,7 +48,7 @@ _WHOLE = ("tracked",)
 def open_settings(
     autopilot: AutopilotLink,
     exchange: Exchange,
-    pause: Callable[[bool], None],
+    commands: Commands,
     log: FlightLog,
 ) -> OwnParameters:
     """Have the settings of a running service answered for over the autopilot's link.
@@ -54,7 +56,7 @@ def open_settings(
     Args:
         autopilot: sends poses.
         exchange: votes for updates.
-        pause: holds poses back, or sends them again.
+        commands: hold poses back, and send them again.
         log: told of every change.
     """
 
@@ -67,12 +69,14 @@ def open_settings(
         _log.warning("%s stays as it is: %s", name, why)
 
     parameters = OwnParameters(
-        tuple(_settings(autopilot, exchange, pause)),
+        tuple(_settings(autopilot, exchange, commands.pause)),
         lambda name, value, n, index: autopilot.send(parameter_value(name, value, n, index)),
         changed,
         refused,
     )
     autopilot.on_parameter = parameters.take
+    # Ground stations ask once, and show what they were told last.
+    commands.on_pause = lambda: parameters.tell(_PAUSED)
     return parameters
 
 
@@ -101,7 +105,7 @@ def _settings(
         change: dict[str, Any] = {field: int(value) if field in _WHOLE else value}
         exchange.update_options = replace(exchange.update_options, **change)
 
-    yield Setting("VCL_PAUSED", lambda: float(autopilot.is_paused), set_paused)
+    yield Setting(_PAUSED, lambda: float(autopilot.is_paused), set_paused)
     for name, field in _POSES.items():
         yield Setting(name, partial(of_poses, field), partial(set_of_poses, field))
     for name, field in _UPDATES.items():

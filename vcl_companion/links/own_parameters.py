@@ -88,6 +88,10 @@ class OwnParameters:
                 self._set(self._settings[self._index[name]], message)
                 self._tell(self._index[name])
 
+    def tell(self, name: str) -> None:
+        """Tell one that has been changed by something else than a parameter's message."""
+        self._tell(self._index[name])
+
     async def run(self) -> None:
         """Send the lists that were asked for, until cancelled."""
         while True:
