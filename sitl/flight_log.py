@@ -25,7 +25,8 @@ class FrameRow(msgspec.Struct, frozen=True):
     """What became of one frame, and how long it took from its arrival to that.
 
     ``latency_ms`` is None for a frame that was never looked at; ``by`` is what the pose
-    sent for it relies on, "patches", "features", "peer" or "motion", None when none was.
+    sent for it relies on, "patches", "features", "peer" or "motion", None when none was: a
+    localized frame then has the ``reason`` why the autopilot did not need it.
     """
 
     sequence: int
@@ -37,6 +38,18 @@ class FrameRow(msgspec.Struct, frozen=True):
     inliers: int = 0
     source: Literal["intra", "inter", "fused"] | None = None
     by: str | None = None
+
+    @property
+    def is_held_back(self) -> bool:
+        """Whether it has a pose that was not sent."""
+        return self.outcome == "localized" and self.by is None and self.reason is not None
+
+
+class PropagatedRow(msgspec.Struct, frozen=True):
+    """A pose between frames that the autopilot was sent, and how long after the last fix."""
+
+    at_ns: int
+    since_fix_s: float
 
 
 class EstimateRow(msgspec.Struct, frozen=True):
@@ -111,6 +124,7 @@ class FlightLog:
     maps: tuple[MapRow, ...]
     summary: SummaryRow | None
     clocks: tuple[ClockRow, ...] = ()
+    propagated: tuple[PropagatedRow, ...] = ()
 
     def count(self, outcome: str) -> int:
         """Return how many frames had an outcome."""
@@ -141,11 +155,14 @@ def read_flight_log(path: Path, *, cut_off: bool = False) -> FlightLog:
     events: list[EventRow] = []
     maps: list[MapRow] = []
     clocks: list[ClockRow] = []
+    propagated: list[PropagatedRow] = []
     summary: SummaryRow | None = None
     for row, line in _json_lines(path, cut_off=cut_off):
         match line.get("kind"):
             case "frame":
                 frames.append(_converted(line, FrameRow, path, row))
+            case "propagated":
+                propagated.append(_converted(line, PropagatedRow, path, row))
             case "estimate":
                 estimates.append(_converted(line, EstimateRow, path, row))
             case "event":
@@ -159,7 +176,13 @@ def read_flight_log(path: Path, *, cut_off: bool = False) -> FlightLog:
     # A frame that asks peers about itself is answered after younger ones.
     frames.sort(key=lambda frame: frame.sequence)
     return FlightLog(
-        tuple(frames), tuple(estimates), tuple(events), tuple(maps), summary, tuple(clocks)
+        tuple(frames),
+        tuple(estimates),
+        tuple(events),
+        tuple(maps),
+        summary,
+        tuple(clocks),
+        tuple(propagated),
     )
 
 
@@ -172,6 +195,7 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
         tuple(row for log in logs for row in log.maps),
         logs[-1].summary if logs else None,
         tuple(clock for log in logs for clock in log.clocks),
+        tuple(row for log in logs for row in log.propagated),
     )
 
 

@@ -36,7 +36,7 @@ def reliance(frame: FrameRow) -> Reliance:
     for known in RELIANCES:
         if frame.by == known:
             return known
-    if frame.outcome != "localized":
+    if frame.outcome != "localized" or frame.is_held_back:
         return "nothing"
     return "peer" if frame.source == "inter" else "features"
 

@@ -17,6 +17,8 @@ Terms beyond ``sitl.evaluation``'s:
 * ``relies_on``: share of the frames whose sent pose relies on the map by ``patches`` or by
   ``features``, on a ``peer`` alone, on attitude and ``motion`` alone, or where ``nothing``
   was sent.
+* ``between``: poses between frames that the autopilot received (``[autopilot] min_rate_hz``):
+  how many, and their ``ate_m``, the truth interpolated; no other number here is of them.
 * ``fused``: what a real autopilot made of our poses (``sitl.fused``); null for a stand-in.
 * ``mission``: how well it was flown (``sitl.flown_mission``); null in a recorded flight.
 * ``lives``: each run of its daemon, in seconds of the recording: when its process was
@@ -161,6 +163,11 @@ def _drone(drone: DroneResult, duration_s: float) -> dict[str, Any]:
         "within_3_sigma_or_10cm_share": scores.within_3_sigma_or_10cm_share if scores else None,
         "nees_median": scores.nees_median if scores else None,
         "relies_on": shares(log.frames),
+        "between": {
+            "poses": drone.n_between,
+            "ate_m": drone.between.ate_m if drone.between else None,
+            "within_3_sigma_share": drone.between.within_3_sigma_share if drone.between else None,
+        },
         "fused": asdict(drone.fused) if drone.fused else None,
         "mission": asdict(drone.mission) if drone.mission else None,
         "sources": _sources(drone),

@@ -84,7 +84,8 @@ _RELIANCE_NOTE = (
     "Of each frame: the map, recognised by its patches or, at the start and when lost, by "
     "features; a peer that told where we were; attitude and motion since the last of these, where "
     "filter.coast_s allows it (such a frame counts as refused); or nothing. A tick: a peer's word "
-    "was fused as well. Share of the frames in the table."
+    "was fused as well. Share of the frames in the table. Poses between frames are of where the "
+    "last velocity and the autopilot's attitude put the drone; no other number is of them."
 )
 _SOURCE_NOTE = (
     "Share of the frames whose pose came from the frame's own landmarks (intra), from a peer that "
@@ -180,10 +181,14 @@ def _reliance_table(report: Mapping[str, Any]) -> str:
         f'{label} % <span class=swatch style="background:{ink}"></span>'
         for label, ink in RELIANCES.values()
     ]
+    heads += ["between frames", "their ATE cm"]
     rows = []
     for n, (name, drone) in enumerate(report["drones"].items()):
-        said = drone["relies_on"]
-        rows.append(_row(n, name, [_number(said[k], "{:.1f}", 100.0) for k in RELIANCES]))
+        said, between = drone["relies_on"], drone["between"]
+        cells = [_number(said[k], "{:.1f}", 100.0) for k in RELIANCES]
+        cells.append(_number(between["poses"], "{:d}", 1.0))
+        cells.append(_number(between["ate_m"], "{:.1f}", 100.0))
+        rows.append(_row(n, name, cells))
     return _table(heads, rows)
 
 

@@ -17,7 +17,7 @@ from sitl.evaluation import (
     ref_from_world,
     scores,
 )
-from sitl.flight_log import FlightLog, MapRow, estimates_of, read_received
+from sitl.flight_log import FlightLog, MapRow, PropagatedRow, estimates_of, read_received
 from sitl.flown_mission import FlownMission, read_mission
 from sitl.fused import Fused, read_fused
 from sitl.lives import Life, Lives, read_lives, read_log
@@ -53,11 +53,14 @@ class DroneResult:
         name: ``mavN``.
         frames_at_ns: (F,) instants of its frames.
         truth: F true poses in the recording's NED; None where not known.
-        estimates: T poses its autopilot received, at their frames' own instants.
+        estimates: T poses its autopilot received, at their frames' own instants; not those
+            between frames.
         frame_of: (T,) the frame each is about, -1 when it fits none.
         log: its daemon's log.
         errors: estimates against truth; None without truth or alignment.
         scores: those errors in numbers.
+        n_between: how many poses between frames its autopilot received.
+        between: their errors in numbers, the truth interpolated; None like ``errors``.
         alone: the same of what was fused: ``intra``, the frames' own fixes, and
             ``inter``, the peers' proposals, each as it came; only those there were.
         fused: what a real autopilot made of what it was sent; None without one.
@@ -74,6 +77,8 @@ class DroneResult:
     log: FlightLog
     errors: PoseErrors | None
     scores: Scores | None
+    n_between: int
+    between: Scores | None
     alone: Mapping[str, Scores]
     fused: Fused | None
     mission: FlownMission | None
@@ -151,18 +156,28 @@ def gather(plan: FlightPlan, out: Path, events: Iterable[Event] = ()) -> FlightR
     lives = read_lives(out)
     logs = {d.name: read_log(out / "run" / d.name, lives.get(d.name)) for d in plan.drones}
     truths = {d.name: _truth_at_frames(d) for d in plan.drones}
-    heard = {
-        d.name: _of_given(
-            lives.get(d.name),
-            *_on_frames(d, read_received(out / d.name / "received.jsonl", d.system_id)),
+    received = {
+        d.name: _apart(
+            read_received(out / d.name / "received.jsonl", d.system_id), logs[d.name].propagated
         )
+        for d in plan.drones
+    }
+    heard = {
+        d.name: _of_given(lives.get(d.name), *_on_frames(d, received[d.name][0]))
         for d in plan.drones
     }
     network = read_network_log(out)
     alignment = _alignment(*heard[plan.leader], truths[plan.leader])
     drones = tuple(
         _drone_result(
-            d, out, truths[d.name], *heard[d.name], logs[d.name], alignment, lives.get(d.name)
+            d,
+            out,
+            truths[d.name],
+            *heard[d.name],
+            received[d.name][1],
+            logs[d.name],
+            alignment,
+            lives.get(d.name),
         )
         for d in plan.drones
     )
@@ -192,6 +207,7 @@ def _drone_result(
     truth: tuple[Pose | None, ...],
     estimates: Estimates,
     frame_of: NDArray[np.int64],
+    between: Estimates,
     log: FlightLog,
     alignment: Pose | None,
     lives: Lives | None,
@@ -211,6 +227,8 @@ def _drone_result(
         log=log,
         errors=errors if errors is not None and len(errors.at_ns) else None,
         scores=scores(errors, axes) if errors is not None else None,
+        n_between=len(between.at_ns),
+        between=None if alignment is None else _between(planned, between, alignment, axes),
         alone={} if alignment is None else _alone(planned, truth, log, alignment, axes),
         fused=read_fused(out / planned.name, estimates, planned.drone.truth, alignment),
         mission=read_mission(out / planned.name, planned.drone.truth, alignment),
@@ -238,6 +256,30 @@ def _alone(
     return out
 
 
+def _apart(received: Estimates, propagated: Sequence[PropagatedRow]) -> tuple[Estimates, Estimates]:
+    """Return what frames gave of what was received, and what the daemon says lies between."""
+    known = np.array([row.at_ns // 1000 for row in propagated], dtype=np.int64)
+    lies_between = np.isin(received.at_ns // 1000, known)
+    return _chosen(received, ~lies_between), _chosen(received, lies_between)
+
+
+def _chosen(estimates: Estimates, which: NDArray[np.bool_]) -> Estimates:
+    kept = np.flatnonzero(which)
+    poses = tuple(estimates.world_from_body[n] for n in kept)
+    return Estimates(estimates.at_ns[kept], poses, estimates.covariances[kept])
+
+
+def _between(
+    planned: PlannedDrone, between: Estimates, alignment: Pose, axes: Array
+) -> Scores | None:
+    """Return how good the poses between frames were, by the truth between its own instants."""
+    truth = planned.drone.truth
+    if truth is None:
+        return None
+    true = tuple(truth.pose_at(at_ns) for at_ns in between.at_ns.tolist())
+    return scores(pose_errors(between, true, alignment), axes)
+
+
 def _truth_at_frames(planned: PlannedDrone) -> tuple[Pose | None, ...]:
     truth = planned.drone.truth
     return tuple(truth.pose_at(f.at_ns) if truth else None for f in planned.drone.frames)
@@ -263,10 +305,8 @@ def _of_given(
     """Leave out poses of frames that a daemon had in hand when it was killed."""
     if lives is None or not any(life.killed_at_ns is not None for life in lives.lives):
         return estimates, frame_of
-    kept = np.flatnonzero((frame_of < 0) | np.isin(frame_of, np.array(lives.frames)))
-    poses = tuple(estimates.world_from_body[n] for n in kept)
-    left = Estimates(estimates.at_ns[kept], poses, estimates.covariances[kept])
-    return left, frame_of[kept]
+    kept = (frame_of < 0) | np.isin(frame_of, np.array(lives.frames))
+    return _chosen(estimates, kept), frame_of[kept]
 
 
 def _whose_maps(plan: FlightPlan, logs: Mapping[str, FlightLog], lives: Mapping[str, Lives]) -> str:
@@ -320,7 +360,7 @@ def _doubts(drone: DroneResult) -> list[Event]:
     strangers = int(np.sum(drone.frame_of < 0))
     if strangers:
         out.append(f"{strangers} poses carry the time of no frame")
-    logged = drone.log.count("localized")
+    logged = drone.log.count("localized") - sum(f.is_held_back for f in drone.log.frames)
     if logged != drone.n_localized:
         out.append(f"{logged} frames localized by the log, {drone.n_localized} poses received")
     coasted = sum(frame.by == "motion" for frame in drone.log.frames)

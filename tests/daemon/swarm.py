@@ -33,9 +33,11 @@ from vcl_companion.daemon.message_requests import MessageRequests
 from vcl_companion.daemon.onboard_computer import OnboardComputer
 from vcl_companion.daemon.saved_map import SavedMap
 from vcl_companion.daemon.settings import open_settings
+from vcl_companion.daemon.teller import Teller
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.counters import LinkCounters
 from vcl_companion.links.key_file import make_key_file
 from vcl_companion.links.messages import Tunnel
@@ -208,9 +210,12 @@ class Flyer(Drone):
         source = StreamCamera("127.0.0.1", port, size_px, self.clock)
         with ThreadPoolExecutor(1) as executor:
             health = Health(self.autopilot_link, self.log)
+            teller = Teller(
+                self.autopilot_link, self.estimator, self.clock, self.log, AutopilotOptions()
+            )
             companion = Companion(
                 source, FrameOutcomes(source, self.clock, health, self.log), sensor,
-                self.autopilot_link, self.maps, self.estimator, self.exchange.inter,
+                self.autopilot_link, teller, self.maps, self.estimator, self.exchange.inter,
                 self.exchange.on_frame, health, self.log, executor, self.work,
                 PipelineOptions(demo.FEATURES, LocalizationOptions(), TrackingOptions()),
                 frame_wait_s=0.1,

@@ -31,9 +31,11 @@ from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.inter_target import InterTarget
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.teller import Teller
 from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.geometry.rotation import matrix_from_euler, quaternion_from_matrix
 from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.localization.intra import LocalizationOptions, Localized, NotLocalized
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.pose_filter import FilterOptions
@@ -42,6 +44,7 @@ from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
 
 DRONE = 2
+FRAMES_ALONE = AutopilotOptions(min_rate_hz=0.0)
 OPTIONS = PipelineOptions(demo.FEATURES, LocalizationOptions(), TrackingOptions())
 
 
@@ -135,7 +138,10 @@ def nobody_to_ask(work: MapWork, clock: ManualClock) -> InterTarget:
 
 @contextlib.asynccontextmanager
 async def flight(
-    path: Path, frame_wait_s: float = 0.1, coast_s: float = 0.0
+    path: Path,
+    frame_wait_s: float = 0.1,
+    coast_s: float = 0.0,
+    rates: AutopilotOptions = FRAMES_ALONE,
 ) -> AsyncIterator[Flight]:
     """A companion with everything around it; its own two coroutines do not run yet."""
     first = demo.shot(DRONE)
@@ -161,8 +167,9 @@ async def flight(
         outcomes = FrameOutcomes(camera, clock, health, log)
         motion = FilterOptions(coast_s=coast_s)
         estimator = Estimator(motion, OPTIONS.localization, lambda _: None)
+        teller = Teller(link, estimator, clock, log, rates)
         companion = Companion(
-            camera, outcomes, sensor, link, maps, estimator, nobody_to_ask(work, clock),
+            camera, outcomes, sensor, link, teller, maps, estimator, nobody_to_ask(work, clock),
             history.add, health, log, executor, work, OPTIONS, frame_wait_s,
         )  # fmt: skip
         await stack.enter_async_context(beside(link.run()))
@@ -185,11 +192,14 @@ async def flight(
 
 @contextlib.asynccontextmanager
 async def flying(
-    path: Path, frame_wait_s: float = 0.1, coast_s: float = 0.0
+    path: Path,
+    frame_wait_s: float = 0.1,
+    coast_s: float = 0.0,
+    rates: AutopilotOptions = FRAMES_ALONE,
 ) -> AsyncIterator[Flight]:
     """The same, in flight."""
     async with (
-        flight(path, frame_wait_s, coast_s) as up,
+        flight(path, frame_wait_s, coast_s, rates) as up,
         beside(up.companion.read_camera(), up.companion.run()),
     ):
         await up.server.connected()

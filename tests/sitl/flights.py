@@ -62,6 +62,9 @@ class Flight:
         proposed: (drone, frame) that a peer said a pose of, and how far it was off, m;
             without a fix of its own such a frame has only that.
         starved: (drone, frame) without a fix of its own.
+        held_back: (drone, frame) localized, and not sent.
+        between: (drone, frame) that a pose halfway to the next was sent after, and how far it
+            was off, m.
         coasted: (drone, frame) refused, and sent by attitude and motion alone.
         network: what the relay between the drones counted, if it did.
         features: (drone, frame) whose own fix rests on features, not on patches.
@@ -77,6 +80,8 @@ class Flight:
     unlogged: frozenset[tuple[str, int]] = frozenset()
     proposed: Mapping[tuple[str, int], float] = field(default_factory=dict)
     starved: frozenset[tuple[str, int]] = frozenset()
+    held_back: frozenset[tuple[str, int]] = frozenset()
+    between: Mapping[tuple[str, int], float] = field(default_factory=dict)
     coasted: frozenset[tuple[str, int]] = frozenset()
     features: frozenset[tuple[str, int]] = frozenset()
     network: NetworkLog | None = None
@@ -161,6 +166,11 @@ def _log(name: str, n: int, flight: Flight, revision: str, n_bytes: int) -> list
             source = "inter" if (name, k) in flight.starved else source
         by: str | None = "features" if (name, k) in flight.features else "patches"
         by = "peer" if source == "inter" else by
+        if (name, k) in flight.held_back:
+            by, reason = None, "held back: more than 30 poses a second"
+        if (name, k) in flight.between:
+            between_ns = at_ns(n, k) + PERIOD_NS // 2
+            lines.append({"kind": "propagated", "at_ns": between_ns, "since_fix_s": 0.1})
         if source is None:
             by = "motion" if (name, k) in flight.coasted else None
         if source in ("intra", "fused"):
@@ -209,16 +219,26 @@ def _received(name: str, n: int, flight: Flight) -> list[dict[str, Any]]:
     heartbeat = {"system": n + 1, "component": 197, "type": "HEARTBEAT", "fields": {}}
     lines: list[dict[str, Any]] = [heartbeat, stranger]
     for k in range(flight.n_frames):
-        if (name, k) in flight.refused | flight.dropped:
-            continue
-        truth = NED_FROM_WORLD.inverse() @ ned_from_body(n, k)
-        error = flight.error(name, k)
-        x, y, z = truth.translation + error[:3]
-        roll, pitch, yaw = np.add(euler_from_matrix(truth.rotation), error[3:])
-        fields = {"usec": at_ns(n, k) // 1000, "x": x, "y": y, "z": z, "roll": roll,
-                  "pitch": pitch, "yaw": yaw, "reset_counter": 0,
-                  "covariance": upper_from_covariance(np.diag(SIGMAS**2)).tolist()}  # fmt: skip
-        lines.append({**heartbeat, "type": "VISION_POSITION_ESTIMATE", "fields": fields})
+        told = []
+        if (name, k) not in flight.refused | flight.dropped | flight.held_back:
+            told.append((at_ns(n, k), ned_from_body(n, k), flight.error(name, k)))
+        if (name, k) in flight.between:
+            off = np.array([flight.between[name, k], 0, 0, 0, 0, 0])
+            half_ns = at_ns(n, k) + PERIOD_NS // 2
+            around = Trajectory.from_poses(
+                [at_ns(n, k), at_ns(n, k + 1)], [ned_from_body(n, k), ned_from_body(n, k + 1)]
+            )
+            halfway = around.pose_at(half_ns)
+            assert halfway is not None
+            told.append((half_ns, halfway, off))
+        for instant, true, error in told:
+            truth = NED_FROM_WORLD.inverse() @ true
+            x, y, z = truth.translation + error[:3]
+            roll, pitch, yaw = np.add(euler_from_matrix(truth.rotation), error[3:])
+            fields = {"usec": instant // 1000, "x": x, "y": y, "z": z, "roll": roll,
+                      "pitch": pitch, "yaw": yaw, "reset_counter": 0,
+                      "covariance": upper_from_covariance(np.diag(SIGMAS**2)).tolist()}  # fmt: skip
+            lines.append({**heartbeat, "type": "VISION_POSITION_ESTIMATE", "fields": fields})
     return lines
 
 

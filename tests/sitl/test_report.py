@@ -334,6 +334,32 @@ def test_a_pose_at_the_time_of_no_frame_is_kept_and_said(tmp_path: Path) -> None
     ]
 
 
+def test_poses_between_frames_are_counted_apart(tmp_path: Path) -> None:
+    plain, _, _ = reported(tmp_path / "plain", Flight())
+    between = {("mav1", k): 0.3 for k in range(2, 6)}
+    result, report, out = reported(tmp_path / "between", Flight(between=between))
+    drone = report["drones"]["mav1"]
+    assert drone["between"]["poses"] == 4
+    assert drone["between"]["ate_m"] == pytest.approx(0.3, abs=1e-3)
+    assert report["drones"]["mav0"]["between"] == {
+        "poses": 0, "ate_m": None, "within_3_sigma_share": None,
+    }  # fmt: skip
+    # Everything else is of frames, as if there were none.
+    assert result.drones[1].scores == plain.drones[1].scores
+    assert result.drones[1].frame_of.tolist() == [*range(12)]
+    assert not [event for event in report["events"] if event["kind"] == "harness"]
+    assert "between frames" in page_of(result, out)
+
+
+def test_a_localized_frame_that_was_held_back_is_no_pose_that_got_lost(tmp_path: Path) -> None:
+    result, report, _ = reported(tmp_path, Flight(held_back=frozenset({("mav1", 3), ("mav1", 7)})))
+    drone = report["drones"]["mav1"]
+    assert (drone["frames_localized"], result.drones[1].n_localized) == (12, 10)
+    assert drone["relies_on"]["nothing"] == pytest.approx(2 / 12, abs=1e-6)
+    assert drone["unaccounted"] == 0
+    assert not [event for event in report["events"] if event["kind"] == "harness"]
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [

@@ -36,6 +36,7 @@ from vcl_companion.daemon.saved_map import SavedMap
 from vcl_companion.daemon.scheduling import run_before_others
 from vcl_companion.daemon.settings import open_settings
 from vcl_companion.daemon.status_writer import StatusWriter
+from vcl_companion.daemon.teller import Teller
 from vcl_companion.daemon.usage import (
     cpu_s,
     forget_peak,
@@ -117,8 +118,10 @@ async def _run(config: Config) -> int:
     autopilot = AutopilotLink(config.autopilot, config.system_id, clock)
     health = Health(autopilot, log)
     outcomes = FrameOutcomes(camera, clock, health, log)
+    tracked = config.pipeline == "default"
     # The paper's pipeline sends what it has measured, and nothing else.
-    motion = config.filter if config.pipeline == "default" else replace(config.filter, coast_s=0.0)
+    motion = config.filter if tracked else replace(config.filter, coast_s=0.0)
+    told = config.autopilot if tracked else replace(config.autopilot, min_rate_hz=0.0)
     estimator = Estimator(
         motion,
         config.localization,
@@ -142,7 +145,6 @@ async def _run(config: Config) -> int:
     give_back_freed()
     give_back_files()
     forget_peak()
-    tracked = config.pipeline == "default"
     # The paper's pipeline would leave nothing to others: a frame takes longer than it may.
     realtime = tracked and config.scheduling == "realtime"
     pipeline = PipelineOptions(config.features, config.localization, config.tracking)
@@ -202,6 +204,7 @@ async def _run(config: Config) -> int:
         outcomes,
         sensor,
         autopilot,
+        Teller(autopilot, estimator, clock, log, told),
         maps,
         estimator,
         exchange.inter,

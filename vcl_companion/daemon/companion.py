@@ -20,9 +20,9 @@ from vcl_companion.daemon.inter_target import Asked, InterTarget
 from vcl_companion.daemon.mailbox import FramesBehind, Mailbox
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.teller import Teller
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot import AutopilotLink
-from vcl_companion.links.vision_pose import PoseEstimate
 from vcl_companion.localization.intra import Localized, NotLocalized
 from vcl_companion.localization.pipeline import Effort, PipelineOptions, is_doubtful, localize
 from vcl_companion.localization.pose_filter import FilterState, NotFused
@@ -90,7 +90,8 @@ class Companion:
         camera: where frames come from.
         outcomes: where each is answered.
         sensor: the camera's calibration and mounting.
-        autopilot: gives attitude, takes poses.
+        autopilot: gives attitude.
+        teller: tells it poses.
         maps: the current map.
         estimator: the pose filter.
         inter: asks peers where we are.
@@ -110,6 +111,7 @@ class Companion:
         outcomes: FrameOutcomes,
         sensor: Sensor,
         autopilot: AutopilotLink,
+        teller: Teller,
         maps: MapStore,
         estimator: Estimator,
         inter: InterTarget,
@@ -125,6 +127,7 @@ class Companion:
         self._outcomes = outcomes
         self._sensor = sensor
         self._autopilot = autopilot
+        self._teller = teller
         self._maps = maps
         self._estimator = estimator
         self._inter = inter
@@ -138,7 +141,6 @@ class Companion:
         self._mailbox = Mailbox()
         self._over = asyncio.Event()
         self._vain: StoredMap | None = None
-        self._sent_at_ns = -1
         self._doubted_at_s = self._fell_back_at_s = self._search_again_at_s = -math.inf
         self._searched: StoredMap | None = None
         self._search_over = asyncio.Event()
@@ -154,6 +156,7 @@ class Companion:
         """
         async for frame in self._camera.frames():
             self._outcomes.opened(frame)
+            self._teller.arrived(frame.captured_at_ns)
             replaced = self._mailbox.put(frame)
             if replaced is not None:
                 self._drop(replaced)
@@ -165,6 +168,7 @@ class Companion:
     async def run(self) -> None:
         """Localize frames until cancelled."""
         async with asyncio.TaskGroup() as beside:
+            beside.create_task(self._teller.run())
             while True:
                 frame = await self._mailbox.take()
                 stored = self._maps.current or await self._first_map(frame)
@@ -223,6 +227,7 @@ class Companion:
             What they are asked; None when nobody is and the frame is answered.
         """
         ned_from_body = await self._attitude_of(frame)
+        await self._teller.tell_until(frame.captured_at_ns)
         now_s = asyncio.get_running_loop().time()
         follows = stored.templates is not None
         may_doubt = now_s >= self._doubted_at_s + _DOUBT_EVERY_S
@@ -448,27 +453,12 @@ class Companion:
         n_inliers: int = 0,
     ) -> NotLocalized | None:
         """Send the pose of a frame, at its own time; or say why it cannot be."""
-        why_not = self._tell(state, frame.captured_at_ns)
-        if why_not is not None:
-            return NotLocalized(why_not, n_matched, n_inliers)
-        self._sent_at_ns = max(self._sent_at_ns, frame.captured_at_ns)
-        self._outcomes.sent(frame, source, by, n_matched, n_inliers)
+        untold = self._teller.tell(state, frame.captured_at_ns)
+        if untold is not None and not untold.is_held_back:
+            return NotLocalized(untold.reason, n_matched, n_inliers)
+        held_back = untold.reason if untold else ""
+        self._outcomes.sent(frame, source, by, n_matched, n_inliers, held_back)
         return None
-
-    def _tell(self, state: FilterState, at_ns: int) -> str | None:
-        """Send the autopilot a state's pose in the frame that it knows, or say why not."""
-        local_from_world = self._estimator.local_from_world
-        turn = local_from_world.rotation
-        return self._autopilot.send_pose(
-            PoseEstimate(
-                local_from_world @ state.world_from_body,
-                state.pose_covariance(),
-                turn @ state.velocity_world,
-                turn @ state.velocity_covariance() @ turn.T,
-                at_ns,
-                self._estimator.n_resets,
-            )
-        )
 
     def _give_up(self, frame: Frame, why: NotLocalized) -> None:
         """Refuse a frame; while the last fix is fresh, attitude and motion still say where it is.
@@ -478,10 +468,8 @@ class Companion:
         """
         self._health.refused(why.reason)
         at_ns = frame.captured_at_ns
-        state = self._estimator.coasted_at(at_ns) if at_ns > self._sent_at_ns else None
-        coasted = state is not None and self._tell(state, at_ns) is None
-        if coasted:
-            self._sent_at_ns = at_ns
+        state = self._estimator.coasted_at(at_ns)
+        coasted = state is not None and self._teller.tell(state, at_ns) is None
         self._outcomes.refuse(frame, why, coasted=coasted)
 
     def _drop(self, frame: Frame) -> None:

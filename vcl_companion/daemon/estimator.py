@@ -153,8 +153,37 @@ class Estimator:
             return None
         if not 0 < at_ns - state.fixed_at_ns <= self._options.coast_s * 1e9:
             return None
+        return state if self._is_certain(state) else None
+
+    def propagated(
+        self, at_ns: int, ned_from_body: Array | None, within_s: float
+    ) -> FilterState | None:
+        """Return where attitude and motion put us at an instant that no frame is of.
+
+        Args:
+            at_ns: the instant.
+            ned_from_body: (3, 3) attitude of it, or None.
+            within_s: how long after a fix.
+
+        Returns:
+            The state; None when that tells too little: the fix is too long ago, or a frame since
+            gave none and ``coast_s`` is over, the position too vague, without an attitude, or
+            while the frames contradict the state.
+        """
+        state = self._history.before(at_ns)
+        if state is None or ned_from_body is None or self._n_contradicted:
+            return None
+        if state.at_ns > state.fixed_at_ns:
+            within_s = self._options.coast_s
+        if at_ns - state.fixed_at_ns > max(within_s, self._options.coast_s) * 1e9:
+            return None
+        there = predict(state, at_ns, ned_from_body, self._options)
+        return there if there is not None and self._is_certain(there) else None
+
+    def _is_certain(self, state: FilterState) -> bool:
+        """Whether a state's position is known as well as a frame has to tell it."""
         variances = np.linalg.eigvalsh(state.pose_covariance()[:3, :3])
-        return state if variances[-1] <= self._localization.max_sigma_m**2 else None
+        return bool(variances[-1] <= self._localization.max_sigma_m**2)
 
     def take_fix(
         self,

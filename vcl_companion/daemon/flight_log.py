@@ -72,7 +72,10 @@ class FlightLog:
         source: PoseSource | None = None,
         by: Basis | None = None,
     ) -> None:
-        """Write what became of a frame; ``by``: what the pose sent for it relies on, if one was."""
+        """Write what became of a frame; ``by``: what the pose sent for it relies on, if one was.
+
+        A localized frame without ``by`` was held back, for a ``reason``: it was not needed.
+        """
         self.frames[outcome] += 1
         if outcome == "refused":
             known = reason in self.refusals or len(self.refusals) < _MAX_REASONS
@@ -122,6 +125,10 @@ class FlightLog:
             fused=fused,
             reason=reason or None,
         )
+
+    def propagated(self, at_ns: int, since_fix_s: float) -> None:
+        """Write that a pose between frames was sent, so long after the last fix."""
+        self._write(kind="propagated", at_ns=at_ns, since_fix_s=since_fix_s)
 
     def missed(self, n_frames: int) -> None:
         """Count frames that were dropped before they reached us; of these there are no lines."""

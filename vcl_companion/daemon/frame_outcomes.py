@@ -25,7 +25,8 @@ class _Sent:
     n_matched: int
     n_inliers: int
     source: PoseSource
-    by: Basis
+    by: Basis | None
+    held_back: str
 
 
 class FrameOutcomes:
@@ -62,11 +63,23 @@ class FrameOutcomes:
         by: Basis,
         n_matched: int = 0,
         n_inliers: int = 0,
+        held_back: str = "",
     ) -> None:
-        """Note that a frame's pose is with the autopilot; ``close`` answers the frame."""
+        """Note that a frame's pose is with the autopilot; ``close`` answers the frame.
+
+        Args:
+            frame: which.
+            source: whence its pose.
+            by: what that relies on.
+            n_matched: landmarks that were found.
+            n_inliers: landmarks that agree.
+            held_back: why the autopilot did not need it; empty when it got it.
+        """
         self._health.localized(by_peers=source == "inter")
         latency_ms = self._latency_ms(frame)
-        self._sent[frame.sequence] = _Sent(latency_ms, n_matched, n_inliers, source, by)
+        self._sent[frame.sequence] = _Sent(
+            latency_ms, n_matched, n_inliers, source, None if held_back else by, held_back
+        )
 
     def close(self, frame: Frame, source: PoseSource | None = None) -> None:
         """Answer a frame whose pose was sent; ``source`` when it is another one by now."""
@@ -75,6 +88,7 @@ class FrameOutcomes:
             frame.sequence,
             frame.captured_at_ns,
             "localized",
+            reason=sent.held_back,
             latency_ms=sent.latency_ms,
             matched=sent.n_matched,
             inliers=sent.n_inliers,

@@ -128,6 +128,10 @@ class AttitudeHistory:
         """
         return min(self._arrivals) - self._latency_ns if self._arrivals else None
 
+    def newest_ns(self, offset_ns: int) -> int | None:
+        """Return the instant of the newest sample, our clock; None without one."""
+        return self._newest_ns(offset_ns) if self._samples else None
+
     def is_near(self, at_ns: int, offset_ns: int) -> bool:
         """Return whether the stream reaches up to ``at_ns``, but for the allowed age."""
         return bool(self._samples) and self._newest_ns(offset_ns) >= at_ns - self._max_age_ns

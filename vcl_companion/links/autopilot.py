@@ -222,8 +222,23 @@ class AutopilotLink:
             return None
         return self._history(at_ns, offset_ns).at(at_ns, offset_ns)
 
-    def send_pose(self, estimate: PoseEstimate) -> str | None:
+    async def news(self) -> None:
+        """Wait until the autopilot says how it is turned, or what time it is."""
+        await self._news.wait()
+
+    def newest_attitude_ns(self) -> int | None:
+        """Return the instant of the newest attitude, our clock; None while it is not known."""
+        now_ns = self._clock.now_ns()
+        offset_ns = self._offset_ns(now_ns)
+        return None if offset_ns is None else self._history(now_ns, offset_ns).newest_ns(offset_ns)
+
+    def send_pose(self, estimate: PoseEstimate, *, is_of_frame: bool = True) -> str | None:
         """Send where we were, as the autopilot's firmware wants to be told.
+
+        Args:
+            estimate: where.
+            is_of_frame: whether a frame gave it; what lies between tells nothing of whether the
+                autopilot follows us.
 
         Returns:
             None when it was sent; else why not: the ground has paused it, it is too old, or the
@@ -265,6 +280,9 @@ class AutopilotLink:
             )
         self._transport.write(frame)
         self._sent_at_s.append(asyncio.get_running_loop().time())
+        if not is_of_frame:
+            self._fusion.sent_between(estimate.at_ns)
+            return None
         sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0))
         self._fusion.sent(estimate.at_ns, pose.translation, sigma_m)
         return None

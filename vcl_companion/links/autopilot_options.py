@@ -39,6 +39,10 @@ class AutopilotOptions:
         max_pose_age_s: a pose of a frame older than this is not sent.
         time_error_s: how well the autopilot knows the instant of a pose, 1 sigma: what it is
             told is uncertain by so much of the way.
+        min_rate_hz: where frames give fewer poses, more are told between them, of where the
+            last frame's velocity and the autopilot's attitude put us; 0: none is.
+        max_rate_hz: frames beyond it are localized, and not told.
+        propagate_s: how long after the last frame with a pose one is told between frames.
     """
 
     link: str = "serial:/dev/serial0:921600"
@@ -51,6 +55,9 @@ class AutopilotOptions:
     ground_systems: tuple[int, ...] = (255,)
     max_pose_age_s: float = 2.0
     time_error_s: float = 0.005
+    min_rate_hz: float = 10.0
+    max_rate_hz: float = 30.0
+    propagate_s: float = 0.5
 
     def __post_init__(self) -> None:
         parse_link(self.link)
@@ -69,3 +76,12 @@ class AutopilotOptions:
             raise ConfigError(f"max_pose_age_s: must be in 0.05..10, got {self.max_pose_age_s}")
         if not 0.0 <= self.time_error_s <= 0.1:
             raise ConfigError(f"time_error_s: must be in 0..0.1, got {self.time_error_s}")
+        if not 1.0 <= self.max_rate_hz <= 100.0:
+            raise ConfigError(f"max_rate_hz: must be in 1..100, got {self.max_rate_hz}")
+        if not 0.0 <= self.min_rate_hz <= self.max_rate_hz:
+            raise ConfigError(
+                f"min_rate_hz: must be in 0..max_rate_hz ({self.max_rate_hz:g}), "
+                f"got {self.min_rate_hz}"
+            )
+        if not 0.0 <= self.propagate_s <= 2.0:
+            raise ConfigError(f"propagate_s: must be in 0..2, got {self.propagate_s}")

@@ -82,6 +82,7 @@ class FusionMonitor:
         self._status: EstimatorStatus | None = None
         self._status_at_ns = 0
         self._first_sent_ns: int | None = None
+        self._last_sent_ns = 0
         self._told = Fusion(FusionState.WAITING)
         self._other_since_ns: int | None = None
         self._ahead_m2_s = self._flown_m2_s2 = 0.0
@@ -102,7 +103,12 @@ class FusionMonitor:
         """Note a pose that the autopilot was sent, its instant and its largest sigma."""
         if self._first_sent_ns is None:
             self._first_sent_ns = at_ns
+        self._last_sent_ns = max(self._last_sent_ns, at_ns)
         self._sent.append(_Sent(at_ns, position, sigma_m))
+
+    def sent_between(self, at_ns: int) -> None:
+        """Note that it was sent a pose that no frame gave: we are not silent, and no more."""
+        self._last_sent_ns = max(self._last_sent_ns, at_ns)
 
     def reported(self, status: EstimatorStatus, at_ns: int) -> None:
         """Note what its estimator says of itself."""
@@ -133,7 +139,7 @@ class FusionMonitor:
     def _seen(self, now_ns: int) -> Fusion:
         if self._first_sent_ns is None:
             return Fusion(FusionState.WAITING)
-        silent_ns = now_ns - self._sent[-1].at_ns
+        silent_ns = now_ns - self._last_sent_ns
         if silent_ns > _SILENT_NS:
             return Fusion(FusionState.LOST, "nothing was sent for a second or more")
         status = self._status

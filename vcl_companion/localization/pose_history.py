@@ -60,6 +60,11 @@ class PoseHistory:
         k = self._nearest(at_ns)
         return None if k is None else self._steps[k].state
 
+    def before(self, at_ns: int) -> FilterState | None:
+        """Return the state after the last frame that is not later than an instant."""
+        earlier = (step.state for step in reversed(self._steps) if step.state.at_ns <= at_ns)
+        return next(earlier, None)
+
     def own_fix_at(self, at_ns: int) -> FilterState | None:
         """Return the state after the frame of an instant, if the frame gave a fix of its own."""
         k = self._nearest(at_ns)

@@ -1,0 +1,171 @@
+"""What the autopilot is told of our pose, and when: frames' poses, and between them where we are.
+
+Between two frames the state is carried on by its velocity and by the autopilot's own attitude. That
+is no news to an estimator which has had the frame's pose and has felt the motion itself: it keeps
+it from taking us for gone, and must not make it surer. All poses between two frames together are
+told with a tenth of the information of one, however many they are, and with next to none about
+the attitude, which is the autopilot's own (``covariance_between``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vcl_companion.clock import Clock
+from vcl_companion.daemon.estimator import Estimator
+from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.pacer import Pacer
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.links.autopilot_options import AutopilotOptions
+from vcl_companion.links.vision_pose import PoseEstimate
+from vcl_companion.localization.pose_filter import FilterState
+
+# Of the information of one pose, in all those between two frames.
+_INFORMATION_BETWEEN = 0.1
+# How well their attitude is said to be known besides, 1 sigma.
+_UNKNOWN_TURN_RAD = 1.0
+
+
+@dataclass(frozen=True)
+class Untold:
+    """A frame's pose was not told.
+
+    Attributes:
+        reason: for people.
+        is_held_back: whether it is as good as any, and was not needed.
+    """
+
+    reason: str
+    is_held_back: bool = False
+
+
+class Teller:
+    """Tells poses in the order of their instants; everything happens in the event loop's thread.
+
+    Args:
+        autopilot: is told, and says how it is turned.
+        estimator: where we are, and the frame that the autopilot knows.
+        clock: time base of the frames.
+        log: told of every pose between frames.
+        options: the rates.
+    """
+
+    def __init__(
+        self,
+        autopilot: AutopilotLink,
+        estimator: Estimator,
+        clock: Clock,
+        log: FlightLog,
+        options: AutopilotOptions,
+    ) -> None:
+        self._autopilot = autopilot
+        self._estimator = estimator
+        self._clock = clock
+        self._log = log
+        self._propagate_s = options.propagate_s
+        self._pacer = Pacer(options.min_rate_hz, options.max_rate_hz)
+        self._unseen: list[int] = []
+
+    def arrived(self, at_ns: int) -> None:
+        """Note a frame that has come: nothing later is told until it is looked at."""
+        self._pacer.arrived(at_ns)
+        self._unseen = [*self._still_unseen(), at_ns]
+
+    def tell(self, state: FilterState, at_ns: int) -> Untold | None:
+        """Tell a frame's pose at its own instant, or say why not."""
+        held_back = self._pacer.holds_back(at_ns)
+        if held_back:
+            return Untold(held_back, is_held_back=True)
+        why_not = self._send(state, at_ns)
+        if why_not is not None:
+            return Untold(why_not)
+        self._pacer.told(at_ns, self._clock.now_ns() - at_ns)
+        return None
+
+    async def run(self) -> None:
+        """Tell what is due between frames as the autopilot's attitude of then comes in."""
+        while True:
+            await self._autopilot.news()
+            await self._tell_between(None)
+
+    async def tell_until(self, at_ns: int) -> None:
+        """Tell what lies before a frame that is about to be looked at, and was not due yet."""
+        await self._tell_between(at_ns)
+
+    async def _tell_between(self, until_ns: int | None) -> None:
+        """Tell poses between frames: those before an instant, or those that are due by now."""
+        while True:
+            now_ns = self._clock.now_ns() if until_ns is None else None
+            between = self._pacer.next_between(now_ns)
+            if between is None:
+                return
+            at_ns = between.at_ns
+            if until_ns is None:
+                newest_ns = self._autopilot.newest_attitude_ns()
+                if self._clock.now_ns() < between.due_ns or newest_ns is None or newest_ns < at_ns:
+                    return
+            elif self._is_too_near(at_ns, until_ns):
+                return
+            if any(self._is_too_near(at_ns, frame_ns) for frame_ns in self._still_unseen()):
+                return
+            # Waits for nothing: no frame's pose is told meanwhile.
+            attitude = await self._autopilot.attitude_at(at_ns, 0.0)
+            ned_from_body = None if attitude is None else attitude.ned_from_body
+            state = self._estimator.propagated(at_ns, ned_from_body, self._propagate_s)
+            if state is None:
+                return
+            if self._send(state, at_ns, between.share) is not None:
+                return
+            self._log.propagated(at_ns, (at_ns - state.fixed_at_ns) * 1e-9)
+            self._pacer.told_between(at_ns)
+
+    def _still_unseen(self) -> list[int]:
+        """Return the instants of frames that have come, and were not looked at yet."""
+        return [at_ns for at_ns in self._unseen if not self._estimator.has_looked_at(at_ns)]
+
+    def _is_too_near(self, at_ns: int, frame_ns: int) -> bool:
+        """Whether a pose between frames would come after a frame's, or leave it no room."""
+        return at_ns > frame_ns - self._pacer.room_ns
+
+    def _send(self, state: FilterState, at_ns: int, share: float | None = None) -> str | None:
+        """Send a state's pose in the frame that the autopilot knows, or say why not.
+
+        Args:
+            state: of the instant.
+            at_ns: the instant.
+            share: see ``covariance_between``; None for a frame's pose.
+        """
+        local_from_world = self._estimator.local_from_world
+        turn = local_from_world.rotation
+        is_of_frame = share is None
+        covariance, velocity = state.pose_covariance(), state.velocity_covariance()
+        if share is not None:
+            covariance, velocity = covariance_between(covariance, velocity, share)
+        return self._autopilot.send_pose(
+            PoseEstimate(
+                local_from_world @ state.world_from_body,
+                covariance,
+                turn @ state.velocity_world,
+                turn @ velocity @ turn.T,
+                at_ns,
+                self._estimator.n_resets,
+            ),
+            is_of_frame=is_of_frame,
+        )
+
+
+def covariance_between(pose: Array, velocity: Array, share: float) -> tuple[Array, Array]:
+    """Return the covariances that a pose between frames is told with.
+
+    Args:
+        pose: (6, 6) local, with what is unknown of the motion since the last frame.
+        velocity: (3, 3), the same.
+        share: of the time between two frames that the pose stands for: what is told in them
+            all has the information of ``_INFORMATION_BETWEEN`` of one.
+    """
+    wider = 1.0 / (_INFORMATION_BETWEEN * share)
+    unknown = np.diag([0.0] * 3 + [_UNKNOWN_TURN_RAD**2] * 3)
+    return wider * pose + unknown, wider * velocity
