@@ -110,6 +110,11 @@ class Autopilot(asyncio.DatagramProtocol):
         fields = (boot_ms, *(float(q) for q in quaternion), 0, 0, 0, 0, 0, 0, 0)
         self._say(wire.packed(wire.ATTITUDE_QUATERNION, *fields, system=self._system_id))
 
+    def beat(self, autopilot: int, base_mode: int, custom_mode: int) -> None:
+        """Send HEARTBEAT of a quadrotor."""
+        fields = (custom_mode, 2, autopilot, base_mode, 4, 3)
+        self._say(wire.packed(wire.HEARTBEAT, *fields, system=self._system_id))
+
     def _say(self, data: bytes) -> None:
         assert self._transport is not None
         self._transport.sendto(data, self._companion)

@@ -16,8 +16,6 @@ from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_work import MapWork
-from vcl_companion.daemon.teller import Teller
-from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.localization.intra import LocalizationOptions
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.tracking import TrackingOptions
@@ -74,9 +72,7 @@ async def flying(
             FrameOutcomes(camera, drone.clock, health, drone.log),
             sensor,
             drone.autopilot_link,
-            Teller(
-                drone.autopilot_link, drone.estimator, drone.clock, drone.log, AutopilotOptions()
-            ),
+            drone.teller,
             drone.maps,
             drone.estimator,
             drone.exchange.inter,

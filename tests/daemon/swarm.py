@@ -117,6 +117,9 @@ class Drone:
             clock, self.exchange.clocks.answered, open_signing(peers),
         )  # fmt: skip
         self.exchange.attach(self._link)
+        self.teller = Teller(
+            self.autopilot_link, self.estimator, clock, self.log, AutopilotOptions()
+        )
         self.saved = SavedMap(
             self.maps, self.exchange.go_back_to, self.estimator, executor, self.autopilot_link,
             self.log,
@@ -124,7 +127,7 @@ class Drone:
         self.computer = OnboardComputer(log_path.parent)
         self.messages = MessageRequests(self.autopilot_link, self.computer, executor)
         commands = Commands(
-            self.autopilot_link, self.exchange, self.maps, self.estimator, self.saved,
+            self.autopilot_link, self.exchange, self.maps, self.estimator, self.teller, self.saved,
             self.messages, self.log,
         )  # fmt: skip
         self.parameters = open_settings(self.autopilot_link, self.exchange, commands, self.log)
@@ -210,12 +213,9 @@ class Flyer(Drone):
         source = StreamCamera("127.0.0.1", port, size_px, self.clock)
         with ThreadPoolExecutor(1) as executor:
             health = Health(self.autopilot_link, self.log)
-            teller = Teller(
-                self.autopilot_link, self.estimator, self.clock, self.log, AutopilotOptions()
-            )
             companion = Companion(
                 source, FrameOutcomes(source, self.clock, health, self.log), sensor,
-                self.autopilot_link, teller, self.maps, self.estimator, self.exchange.inter,
+                self.autopilot_link, self.teller, self.maps, self.estimator, self.exchange.inter,
                 self.exchange.on_frame, health, self.log, executor, self.work,
                 PipelineOptions(demo.FEATURES, LocalizationOptions(), TrackingOptions()),
                 frame_wait_s=0.1,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import json
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from tests.daemon.waiting import beside, run, until
 from vcl_companion.clock import ManualClock
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
-from vcl_companion.daemon.teller import Teller, covariance_between
+from vcl_companion.daemon.teller import Teller, Untold, covariance_between
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import (
     Array,
@@ -264,5 +265,111 @@ def test_without_a_least_rate_frames_alone_are_told(tmp_path: Path) -> None:
             await up.turn_until(START_NS + 1500 * MS)
             assert instants_ms(await up.told()) == [0, 200, 400, 600]
             assert up.logged() == []
+
+    run(scenario())
+
+
+GUIDED = {"autopilot": 3, "base_mode": 128 | 1, "custom_mode": 4}
+LOITER = {**GUIDED, "custom_mode": 5}
+
+
+async def jumps(up: Flight, k: int, off_m: Array) -> Untold | None:
+    """Look at the k-th frame after the drone has been found again, elsewhere."""
+    at_ns = START_NS + k * PERIOD_NS
+    await up.turn_until(at_ns)
+    up.teller.arrived(at_ns)
+    await up.teller.tell_until(at_ns)
+    turned = truth(at_ns).rotation
+    predicted = up.estimator.predicted(at_ns, turned)
+    state = up.estimator.take_fix(predicted, seen(at_ns, off_m), at_ns, turned)
+    assert not isinstance(state, NotLocalized)
+    return up.teller.tell(state, at_ns)
+
+
+AWAY = np.array([3.0, 4.0, 0.0])
+
+
+async def flown_to_a_jump(up: Flight, heartbeat: dict[str, int]) -> Untold | None:
+    for k in range(6):
+        await up.frame(k)
+    up.autopilot.beat(**heartbeat)
+    await until(lambda: up.link.mode.is_armed)
+    up.estimator.forget()
+    return await jumps(up, 6, AWAY)
+
+
+@pytest.mark.parametrize("heartbeat", [GUIDED, LOITER])
+def test_a_place_elsewhere_resets_the_autopilot(tmp_path: Path, heartbeat: dict[str, int]) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            assert await flown_to_a_jump(up, heartbeat) is None
+            poses = await up.told()
+            assert poses[-1][28] == poses[-2][28] + 1
+            assert np.allclose(poses[-1][1:4], truth(START_NS + 6 * PERIOD_NS).translation + AWAY)
+            assert "5.0 m away: the autopilot is reset" in await up.autopilot.texts.get()
+
+    run(scenario())
+
+
+def test_the_same_place_found_anew_does_not(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            for k in range(6):
+                await up.frame(k)
+            up.estimator.forget()
+            await jumps(up, 6, np.zeros(3))
+            assert len({pose[28] for pose in await up.told()}) == 1
+
+    run(scenario())
+
+
+def test_who_flies_to_positions_is_slid_there(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        options = AutopilotOptions(resets="blend", blend_speed_m_s=1.0)
+        async with flying(tmp_path, options) as up:
+            assert await flown_to_a_jump(up, GUIDED) is None
+            for k in range(7, 35):
+                assert await jumps(up, k, AWAY) is None
+            poses = await up.told()
+            assert len({pose[28] for pose in poses}) == 1
+            off = [np.array(p[1:4]) - truth(p[0] * 1000).translation for p in poses]
+            of_jump = instants_ms(poses).index(1200)
+            assert np.linalg.norm(off[of_jump]) < 0.01
+            # How fast it flies is not known before the next frame.
+            off, poses = off[of_jump + 2 :], poses[of_jump + 2 :]
+            slid = [float(np.linalg.norm(b - a)) for a, b in itertools.pairwise(off)]
+            apart_s = [(b[0] - a[0]) * 1e-6 for a, b in itertools.pairwise(poses)]
+            # Between frames as well.
+            assert all(d < 1.0 * s + 0.03 for d, s in zip(slid, apart_s, strict=True))
+            assert np.allclose(off[-1], AWAY, atol=0.01)
+
+    run(scenario())
+
+
+def test_nothing_is_told_until_the_ground_commands_it(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path, AutopilotOptions(resets="wait")) as up:
+            untold = await flown_to_a_jump(up, GUIDED)
+            assert untold is not None
+            assert not untold.is_held_back
+            assert "waiting for the ground" in untold.reason
+            before = (await up.told())[-1]
+            assert await jumps(up, 7, AWAY) is not None
+            await up.turn_until(START_NS + 7 * PERIOD_NS + 180 * MS)
+            assert await up.told() == []  # nor between frames
+            up.teller.allow_jump()
+            assert await jumps(up, 8, AWAY) is None
+            assert (await up.told())[-1][28] == before[28] + 1
+
+    run(scenario())
+
+
+def test_nothing_is_told_until_the_mode_is_another(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path, AutopilotOptions(resets="wait")) as up:
+            assert await flown_to_a_jump(up, GUIDED) is not None
+            up.autopilot.beat(**LOITER)
+            await until(lambda: not up.link.mode.is_steered_by_positions)
+            assert await jumps(up, 7, AWAY) is None
 
     run(scenario())

@@ -201,9 +201,14 @@ def test_a_restarted_autopilot_is_timed_anew() -> None:
             restarted = wire.packed(
                 wire.ATTITUDE_QUATERNION, 3000, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, system=SYSTEM
             )
+            for _ in range(2):  # asked for as the link came up
+                await autopilot.next_of(wire.COMMAND_LONG)
             autopilot.say(restarted)
             while link.round_trip_s is not None:
                 await link.attitude_at(NOW_NS + 1000 * MS, 0.01)
+            # It has forgotten what it was asked to send.
+            async with asyncio.timeout(0.8):  # else asked for after a second
+                assert (await autopilot.next_of(wire.COMMAND_LONG)).fields[7] == 511
             question = await autopilot.next_of(wire.TIMESYNC)
             answer = wire.packed(wire.TIMESYNC, 3000 * MS, question.fields[1], system=SYSTEM)
             autopilot.say(answer)
@@ -342,7 +347,9 @@ def test_a_stalled_service_has_no_heartbeat() -> None:
 @pytest.mark.parametrize(
     "options",
     [{"link": "udp:x"}, {"attitude_rate_hz": 0.0}, {"attitude_latency_s": -1.0},
-     {"max_attitude_age_s": math.nan}, {"allowed_senders": ("drone",)}],
+     {"max_attitude_age_s": math.nan}, {"allowed_senders": ("drone",)},
+     {"min_rate_hz": 31.0}, {"min_rate_hz": -1.0}, {"max_rate_hz": math.nan},
+     {"propagate_s": 3.0}, {"blend_speed_m_s": 0.0}, {"blend_turn_deg_s": 100.0}],
 )  # fmt: skip
 def test_wrong_options_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(ConfigError):

@@ -61,6 +61,37 @@ class Flight:
         return self.monitor.state(self.now_ns).reason
 
 
+def test_where_it_takes_us_to_be_is_known_while_it_has_a_position_and_says_so() -> None:
+    flight = Flight()
+    assert flight.monitor.expected_at(flight.now_ns) is None
+    flight.off = np.array([3.0, 0.0, 0.0])
+    flight.fly(3.0)
+    for late_ns in (-80 * MS, 0, 80 * MS):
+        expected = flight.monitor.expected_at(flight.now_ns + late_ns)
+        assert expected is not None
+        there = position_at(flight.now_ns + late_ns) + flight.off
+        assert np.allclose(expected, there, atol=0.01)
+    assert flight.monitor.expected_at(flight.now_ns + 501 * MS) is None
+    flight.holds_position = True
+    flight.fly(0.1)
+    assert flight.monitor.expected_at(flight.now_ns) is None
+    flight.holds_position, flight.has_position = False, False
+    flight.fly(0.1)
+    assert flight.monitor.expected_at(flight.now_ns) is None
+
+
+def test_poses_between_frames_are_no_silence_and_are_not_compared() -> None:
+    flight = Flight()
+    flight.fly(5.0)
+    flight.sends = False
+    states = []
+    for _ in range(30):
+        states += flight.fly(0.1)
+        flight.monitor.sent_between(flight.now_ns)
+    assert FusionState.LOST not in states
+    assert FusionState.LOST in flight.fly(3.0)
+
+
 def test_nothing_is_expected_of_it_before_the_first_pose() -> None:
     flight = Flight()
     flight.sends = False

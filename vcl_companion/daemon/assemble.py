@@ -199,12 +199,13 @@ async def _run(config: Config) -> int:
         ),
         rng,
     )
+    teller = Teller(autopilot, estimator, clock, log, told)
     companion = Companion(
         camera,
         outcomes,
         sensor,
         autopilot,
-        Teller(autopilot, estimator, clock, log, told),
+        teller,
         maps,
         estimator,
         exchange.inter,
@@ -230,7 +231,7 @@ async def _run(config: Config) -> int:
     exchange.attach(peers)
     saved = SavedMap(maps, exchange.go_back_to, estimator, disk, autopilot, log)
     requests = MessageRequests(autopilot, OnboardComputer(Path()), disk)
-    commands = Commands(autopilot, exchange, maps, estimator, saved, requests, log)
+    commands = Commands(autopilot, exchange, maps, estimator, teller, saved, requests, log)
     parameters = open_settings(autopilot, exchange, commands, log)
 
     async def exchanging() -> None:

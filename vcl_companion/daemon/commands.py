@@ -5,7 +5,8 @@
     USER_2 (31011)   param1 0: save the map in use, for the next start to begin with; 1: forget
                      the saved one
     USER_3 (31012)   reload: fly on the saved map, and look for where we are in it anew
-    USER_4 (31013)   relocalize: forget where we are, and look for it anew
+    USER_4 (31013)   relocalize: forget where we are, look for it anew, and tell the autopilot of it
+                     wherever that is ([autopilot] resets)
     USER_5 (31014)   param1 1: send no poses any more; 0: send them again
 
 What takes time answers COMMAND_ACK IN_PROGRESS until it is over. A command that is repeated
@@ -27,6 +28,7 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.message_requests import MessageRequests
 from vcl_companion.daemon.saved_map import SavedMap
+from vcl_companion.daemon.teller import Teller
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.messages import (
     PAUSE_SENDING,
@@ -83,6 +85,7 @@ class Commands:
         exchange: makes maps, with the others.
         maps: what we fly on.
         estimator: where we are.
+        teller: what the autopilot is told of it.
         saved: the map to begin with.
         requests: answers who asks for messages.
         log: told of every command.
@@ -94,6 +97,7 @@ class Commands:
         exchange: Exchange,
         maps: MapStore,
         estimator: Estimator,
+        teller: Teller,
         saved: SavedMap,
         requests: MessageRequests,
         log: FlightLog,
@@ -102,6 +106,7 @@ class Commands:
         self._exchange = exchange
         self._maps = maps
         self._estimator = estimator
+        self._teller = teller
         self._saved = saved
         self._requests = requests
         self._log = log
@@ -132,6 +137,7 @@ class Commands:
         elif command == RELOCALIZE:
             self._note(message, "relocalize")
             self._estimator.forget()
+            self._teller.allow_jump()
             self._answer(message, RESULT_ACCEPTED)
         elif command == PAUSE_SENDING:
             self._note(message, "send no poses" if first else "send poses again")

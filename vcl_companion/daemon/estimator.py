@@ -180,6 +180,12 @@ class Estimator:
         there = predict(state, at_ns, ned_from_body, self._options)
         return there if there is not None and self._is_certain(there) else None
 
+    def carried_on(
+        self, state: FilterState, at_ns: int, ned_from_body: Array | None
+    ) -> FilterState | None:
+        """Return where a state that was believed once put us at a later instant."""
+        return predict(state, at_ns, ned_from_body, self._options)
+
     def _is_certain(self, state: FilterState) -> bool:
         """Whether a state's position is known as well as a frame has to tell it."""
         variances = np.linalg.eigvalsh(state.pose_covariance()[:3, :3])

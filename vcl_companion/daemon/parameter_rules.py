@@ -108,8 +108,8 @@ def _ardupilot(*, sends_velocity: bool) -> tuple[Rule, ...]:
         Rule(("EK3_ENABLE",), "prevents", _is(1.0), 1.0, "EKF3 is switched off"),
         Rule(
             ("VISO_TYPE",), "prevents", _is(1.0), 1.0,
-            "0 hears no poses; 2 drops them for a second after a reset; 3 takes a relocalization "
-            "for its own drift and hides it",
+            "1 hands our resets on; 0 hears no poses; 2 drops them for a second after a reset; 3 "
+            "takes a relocalization for its own drift and hides it",
         ),
         Rule(
             ("EK3_SRC1_POSXY",), "prevents", _is(6.0), 6.0,

@@ -9,6 +9,8 @@ the attitude, which is the autopilot's own (``covariance_between``).
 
 from __future__ import annotations
 
+import logging
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,12 +19,19 @@ from vcl_companion.clock import Clock
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.pacer import Pacer
+from vcl_companion.daemon.resets import Resets
+from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
+from vcl_companion.links.texts import Severity
 from vcl_companion.links.vision_pose import PoseEstimate
 from vcl_companion.localization.pose_filter import FilterState
 
+_log = logging.getLogger(__name__)
+
+# After so long without a pose nobody knows from it where the autopilot takes us to be.
+_SILENT_NS = 1_000_000_000
 # Of the information of one pose, in all those between two frames.
 _INFORMATION_BETWEEN = 0.1
 # How well their attitude is said to be known besides, 1 sigma.
@@ -42,6 +51,15 @@ class Untold:
     is_held_back: bool = False
 
 
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """A pose that was told: the state, the frame of then, and by how much it slid in that."""
+
+    state: FilterState
+    local_from_world: Pose
+    shift: Pose
+
+
 class Teller:
     """Tells poses in the order of their instants; everything happens in the event loop's thread.
 
@@ -50,7 +68,7 @@ class Teller:
         estimator: where we are, and the frame that the autopilot knows.
         clock: time base of the frames.
         log: told of every pose between frames.
-        options: the rates.
+        options: the rates, and what is done about jumps.
     """
 
     def __init__(
@@ -68,6 +86,17 @@ class Teller:
         self._propagate_s = options.propagate_s
         self._pacer = Pacer(options.min_rate_hz, options.max_rate_hz)
         self._unseen: list[int] = []
+        self._last: _Told | None = None
+        self._resets = Resets(
+            options.resets,
+            options.blend_speed_m_s,
+            math.radians(options.blend_turn_deg_s),
+            self._decided,
+        )
+
+    def allow_jump(self) -> None:
+        """Let the next pose be told wherever it is: the ground has asked for it."""
+        self._resets.allow()
 
     def arrived(self, at_ns: int) -> None:
         """Note a frame that has come: nothing later is told until it is looked at."""
@@ -138,23 +167,64 @@ class Teller:
             at_ns: the instant.
             share: see ``covariance_between``; None for a frame's pose.
         """
+        if self._autopilot.is_paused:
+            return "paused by the ground"
         local_from_world = self._estimator.local_from_world
-        turn = local_from_world.rotation
-        is_of_frame = share is None
+        pose = local_from_world @ state.world_from_body
         covariance, velocity = state.pose_covariance(), state.velocity_covariance()
-        if share is not None:
+        if share is None:
+            waits = self._placed(pose, covariance, state, at_ns)
+            if waits:
+                return waits
+        elif not self._resets.has_seen(self._estimator.n_resets):
+            return "a jump is told by a frame"
+        else:
             covariance, velocity = covariance_between(covariance, velocity, share)
-        return self._autopilot.send_pose(
+        told, slides_m_s = self._resets.told(pose, at_ns)
+        turn = self._resets.turn @ local_from_world.rotation
+        why_not = self._autopilot.send_pose(
             PoseEstimate(
-                local_from_world @ state.world_from_body,
+                told,
                 covariance,
-                turn @ state.velocity_world,
+                turn @ state.velocity_world + slides_m_s,
                 turn @ velocity @ turn.T,
                 at_ns,
-                self._estimator.n_resets,
+                self._resets.n_resets,
             ),
-            is_of_frame=is_of_frame,
+            is_of_frame=share is None,
         )
+        if why_not is None:
+            self._last = _Told(state, local_from_world, told @ pose.inverse())
+        return why_not
+
+    def _placed(self, pose: Pose, covariance: Array, state: FilterState, at_ns: int) -> str:
+        """Decide where a frame's pose is told; return why it is not, if it is not."""
+        last = self._last
+        was_silent = last is not None and at_ns - last.state.at_ns > _SILENT_NS
+        expected = None
+        if last is not None and not was_silent:
+            there = self._estimator.carried_on(last.state, at_ns, state.ned_from_body)
+            if there is not None:
+                expected = last.shift @ last.local_from_world @ there.world_from_body
+        else:
+            position = self._autopilot.expected_at(at_ns)
+            expected = None if position is None else Pose(pose.rotation, position)
+        return self._resets.decide(
+            pose,
+            covariance,
+            at_ns,
+            self._estimator.n_resets,
+            expected,
+            self._autopilot.mode,
+            was_silent=was_silent,
+        )
+
+    def _decided(self, what: str, is_for_ground: bool) -> None:
+        """Say what becomes of a jump."""
+        self._log.event("reset", what)
+        _log.info("%s", what)
+        if is_for_ground:
+            self._autopilot.announce(Severity.WARNING, f"VCL {what}")
 
 
 def covariance_between(pose: Array, velocity: Array, share: float) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from vcl_companion.clock import Clock
-from vcl_companion.geometry.rotation import euler_from_matrix, quaternion_from_matrix
+from vcl_companion.geometry.rotation import Array, euler_from_matrix, quaternion_from_matrix
 from vcl_companion.links.attitude import Attitude, AttitudeHistory
 from vcl_companion.links.autopilot_options import AutopilotOptions, ServiceState
 from vcl_companion.links.counters import LinkCounters, LinkTally
@@ -49,6 +49,7 @@ from vcl_companion.links.stream_requests import StreamRequests
 from vcl_companion.links.texts import Severity, Texts
 from vcl_companion.links.timesync import TimesyncEstimator
 from vcl_companion.links.transport import open_transport
+from vcl_companion.links.vehicle_mode import VehicleMode, mode_of
 from vcl_companion.links.vision_pose import Firmware, PoseEstimate, covariance_for, firmware_of
 
 _log = logging.getLogger(__name__)
@@ -101,6 +102,7 @@ class AutopilotLink:
         self._firmware = _FIRMWARE.get(options.profile, Firmware.OTHER)
         self._streams.firmware = self._firmware
         self._first_reset: int | None = None
+        self._mode = VehicleMode()
 
     @property
     def options(self) -> AutopilotOptions:
@@ -187,6 +189,15 @@ class AutopilotLink:
     def fusion(self) -> Fusion:
         """Return what becomes of our poses, by what the autopilot says of itself."""
         return self._fusion.state(self._clock.now_ns())
+
+    def expected_at(self, at_ns: int) -> Array | None:
+        """Return (3,) where the autopilot takes the drone to be, local NED, m; None: unknown."""
+        return self._fusion.expected_at(at_ns)
+
+    @property
+    def mode(self) -> VehicleMode:
+        """How the vehicle is flown, by its last HEARTBEAT."""
+        return self._mode
 
     @property
     def ahead_s(self) -> float | None:
@@ -361,8 +372,10 @@ class AutopilotLink:
             case LocalPosition():
                 self._streams.heard(LOCAL_POSITION_ID)
                 self._take_position(message)
-            case Heartbeat(autopilot=autopilot) if self._options.profile == "auto":
-                self._is_of(firmware_of(autopilot))
+            case Heartbeat():
+                self._mode = mode_of(message)
+                if self._options.profile == "auto":
+                    self._is_of(firmware_of(message.autopilot))
             case CommandAck(command=command, result=result, target_system=target):
                 for_us = target in (0, self._system_id) and command == SET_MESSAGE_INTERVAL
                 if for_us and result != RESULT_ACCEPTED:
@@ -419,6 +432,7 @@ class AutopilotLink:
                 _log.warning("the autopilot has restarted")
                 self._sync.reset()
                 self._fusion = FusionMonitor()
+                self._streams.ask_for_all()
                 (self._by_euler if quaternion else self._by_quaternion).clear()
         self._wake()
 

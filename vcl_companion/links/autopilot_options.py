@@ -42,6 +42,12 @@ class AutopilotOptions:
         min_rate_hz: where frames give fewer poses, more are told between them, of where the
             last frame's velocity and the autopilot's attitude put us; 0: none is.
         max_rate_hz: frames beyond it are localized, and not told.
+        resets: what is done when what is told jumps by more than its own error while the vehicle
+            flies to commanded positions (GUIDED, OFFBOARD), which moves it: ``follow``: the
+            autopilot is reset; ``blend``: what is told slides to its new place; ``wait``: nothing
+            is told until the ground commands it or the mode changes.
+        blend_speed_m_s: of a slide.
+        blend_turn_deg_s: of a slide's heading.
         propagate_s: how long after the last frame with a pose one is told between frames.
     """
 
@@ -58,6 +64,9 @@ class AutopilotOptions:
     min_rate_hz: float = 10.0
     max_rate_hz: float = 30.0
     propagate_s: float = 0.5
+    resets: Literal["follow", "blend", "wait"] = "follow"
+    blend_speed_m_s: float = 0.3
+    blend_turn_deg_s: float = 5.0
 
     def __post_init__(self) -> None:
         parse_link(self.link)
@@ -85,3 +94,7 @@ class AutopilotOptions:
             )
         if not 0.0 <= self.propagate_s <= 2.0:
             raise ConfigError(f"propagate_s: must be in 0..2, got {self.propagate_s}")
+        if not 0.01 <= self.blend_speed_m_s <= 5.0:
+            raise ConfigError(f"blend_speed_m_s: must be in 0.01..5, got {self.blend_speed_m_s}")
+        if not 0.1 <= self.blend_turn_deg_s <= 90.0:
+            raise ConfigError(f"blend_turn_deg_s: must be in 0.1..90, got {self.blend_turn_deg_s}")

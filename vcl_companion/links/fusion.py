@@ -31,6 +31,8 @@ _LASTS_NS = 1_000_000_000
 # and a delay of our poses that it does not know of.
 _APART_M, _SIGMAS, _DELAY_S = 0.5, 5.0, 0.25
 _MAX_KEPT = 256
+# How far from its last report of its position it is taken to fly on as it did.
+_EXPECTED_NS = 500_000_000
 # What squares of the speed have to add up to before the delay is told: 20 s at 1 m/s and 5 Hz.
 _TELLS_OF_DELAY_M2_S2 = 100.0
 _FORGETS = 0.999
@@ -120,6 +122,16 @@ class FusionMonitor:
             return
         self._believed.append(_Believed(at_ns, position, velocity))
         self._compare_delay()
+
+    def expected_at(self, at_ns: int) -> Array | None:
+        """Return (3,) where it takes the drone to be at an instant; None when it does not know."""
+        status = self._status
+        if status is None or status.holds_position or not status.has_position:
+            return None
+        if not self._believed or abs(at_ns - self._believed[-1].at_ns) > _EXPECTED_NS:
+            return None
+        last = self._believed[-1]
+        return last.position + (at_ns - last.at_ns) * 1e-9 * last.velocity
 
     def state(self, now_ns: int) -> Fusion:
         """Return what becomes of our poses; another state than before once it has lasted."""
