@@ -84,7 +84,6 @@ class Flight:
         at_ns = START_NS + k * PERIOD_NS
         await self.turn_until(at_ns)
         self.teller.arrived(at_ns)
-        await self.teller.tell_until(at_ns)
         await self.turn_until(at_ns + late_ms * MS)
         turned = truth(at_ns).rotation
         predicted = self.estimator.predicted(at_ns, turned)
@@ -278,7 +277,6 @@ async def jumps(up: Flight, k: int, off_m: Array) -> Untold | None:
     at_ns = START_NS + k * PERIOD_NS
     await up.turn_until(at_ns)
     up.teller.arrived(at_ns)
-    await up.teller.tell_until(at_ns)
     turned = truth(at_ns).rotation
     predicted = up.estimator.predicted(at_ns, turned)
     state = up.estimator.take_fix(predicted, seen(at_ns, off_m), at_ns, turned)

@@ -227,7 +227,6 @@ class Companion:
             What they are asked; None when nobody is and the frame is answered.
         """
         ned_from_body = await self._attitude_of(frame)
-        await self._teller.tell_until(frame.captured_at_ns)
         now_s = asyncio.get_running_loop().time()
         follows = stored.templates is not None
         may_doubt = now_s >= self._doubted_at_s + _DOUBT_EVERY_S

@@ -79,7 +79,7 @@ class Pacer:
         self._told_ns = self._frame_told_ns = at_ns
 
     def told_between(self, at_ns: int) -> None:
-        """Note that a pose between frames was told, or that there is none of its instant."""
+        """Note that a pose between frames was told."""
         self._told_ns = at_ns
 
     def next_between(self, now_ns: int | None = None) -> Between | None:

@@ -104,7 +104,11 @@ class Teller:
         self._unseen = [*self._still_unseen(), at_ns]
 
     def tell(self, state: FilterState, at_ns: int) -> Untold | None:
-        """Tell a frame's pose at its own instant, or say why not."""
+        """Tell a frame's pose at its own instant, or say why not.
+
+        What lies before it and was not due yet is told first.
+        """
+        self._tell_between(at_ns)
         held_back = self._pacer.holds_back(at_ns)
         if held_back:
             return Untold(held_back, is_held_back=True)
@@ -118,13 +122,9 @@ class Teller:
         """Tell what is due between frames as the autopilot's attitude of then comes in."""
         while True:
             await self._autopilot.news()
-            await self._tell_between(None)
+            self._tell_between(None)
 
-    async def tell_until(self, at_ns: int) -> None:
-        """Tell what lies before a frame that is about to be looked at, and was not due yet."""
-        await self._tell_between(at_ns)
-
-    async def _tell_between(self, until_ns: int | None) -> None:
+    def _tell_between(self, until_ns: int | None) -> None:
         """Tell poses between frames: those before an instant, or those that are due by now."""
         while True:
             now_ns = self._clock.now_ns() if until_ns is None else None
@@ -140,8 +140,7 @@ class Teller:
                 return
             if any(self._is_too_near(at_ns, frame_ns) for frame_ns in self._still_unseen()):
                 return
-            # Waits for nothing: no frame's pose is told meanwhile.
-            attitude = await self._autopilot.attitude_at(at_ns, 0.0)
+            attitude = self._autopilot.known_attitude(at_ns)
             ned_from_body = None if attitude is None else attitude.ned_from_body
             state = self._estimator.propagated(at_ns, ned_from_body, self._propagate_s)
             if state is None:

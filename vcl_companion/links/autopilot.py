@@ -229,6 +229,11 @@ class AutopilotLink:
                 break
         # A good moment to ask: in a replay the clocks of all processes stand together now.
         self._ask_if_due(_SYNC_SLOW_S)
+        return self.known_attitude(at_ns)
+
+    def known_attitude(self, at_ns: int) -> Attitude | None:
+        """Return the attitude at an instant of our clock by what has come; see ``attitude_at``."""
+        offset_ns = self._offset_ns(at_ns)
         if offset_ns is None:
             return None
         return self._history(at_ns, offset_ns).at(at_ns, offset_ns)
