@@ -95,6 +95,18 @@ def test_what_lies_where_a_frame_is_expected_waits_longer_for_it() -> None:
     assert pacer.next_between() is not None
 
 
+def test_what_is_late_is_left_out_when_a_later_one_is_due() -> None:
+    pacer = Pacer(10.0, 30.0)
+    for k in range(4):
+        at_ns = START_NS + k * 200 * MS
+        pacer.arrived(at_ns)
+        pacer.told(at_ns, 0)
+    for now_ms, slot_ms in ((0, 100), (240, 100), (260, 200), (380, 300), (1149, 1000)):
+        slot = pacer.next_between(at_ns + now_ms * MS)
+        assert slot is not None
+        assert slot.at_ns - at_ns == slot_ms * MS
+
+
 @pytest.mark.parametrize("rate_hz", [10.0, 15.0, 20.0, 30.0])
 def test_shares_between_two_frames_add_up_to_less_than_one_at_any_rate(rate_hz: float) -> None:
     pacer = Pacer(rate_hz, 30.0)

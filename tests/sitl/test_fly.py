@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import select
@@ -100,6 +101,18 @@ def test_a_flight_accounts_for_every_frame_and_is_close_to_the_truth(flown: Path
     assert [event for event in report["events"] if event["kind"] == "harness"] == []
 
 
+def test_a_flight_at_five_hertz_tells_ten_poses_a_second(flown: Path) -> None:
+    report = report_in(flown)
+    for name in DRONES:
+        instants = [pose["usec"] for pose in poses_received(flown, name)]
+        assert instants == sorted(set(instants))
+        assert [b - a for a, b in itertools.pairwise(instants)] == [100_000] * (2 * N_FRAMES - 2)
+        between = report["drones"][name]["between"]
+        assert between["poses"] == N_FRAMES - 1
+        # Its speed is not known between the first two.
+        assert 0.0 < between["ate_m"] < 0.3
+
+
 def test_a_flight_leaves_the_files_that_the_format_promises(flown: Path, recording: Path) -> None:
     frames = {d.name: [f.at_ns for f in d.frames] for d in read_recording(recording).drones}
     for name in DRONES:
@@ -188,8 +201,9 @@ def test_nothing_of_the_truth_reaches_a_daemon(
     assert done.returncode == 0, done.stderr
     for name in DRONES:
         before, after = poses_received(flown, name), poses_received(out, name)
-        assert len(before) == N_FRAMES
         assert after == before
+        # Those between frames are the same as well.
+        assert len(before) == 2 * N_FRAMES - 1
         assert report_in(out)["drones"][name]["ate_m"] is None
         assert not (out / name / "truth.tum").exists()
         attitudes = [(folder / name / "attitude.csv").read_bytes() for folder in (flown, out)]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vcl_companion.clock import Clock
+from vcl_companion.clock import Clock, ManualClock
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.pacer import Pacer
@@ -127,14 +127,16 @@ class Teller:
     def _tell_between(self, until_ns: int | None) -> None:
         """Tell poses between frames: those before an instant, or those that are due by now."""
         while True:
-            now_ns = self._clock.now_ns() if until_ns is None else None
-            between = self._pacer.next_between(now_ns)
+            now_ns = self._clock.now_ns()
+            # A clock that is told the time leaps: nothing is late by it.
+            leaps = until_ns is not None or isinstance(self._clock, ManualClock)
+            between = self._pacer.next_between(None if leaps else now_ns)
             if between is None:
                 return
             at_ns = between.at_ns
             if until_ns is None:
                 newest_ns = self._autopilot.newest_attitude_ns()
-                if self._clock.now_ns() < between.due_ns or newest_ns is None or newest_ns < at_ns:
+                if now_ns < between.due_ns or newest_ns is None or newest_ns < at_ns:
                     return
             elif self._is_too_near(at_ns, until_ns):
                 return
