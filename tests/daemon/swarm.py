@@ -117,9 +117,8 @@ class Drone:
             clock, self.exchange.clocks.answered, open_signing(peers),
         )  # fmt: skip
         self.exchange.attach(self._link)
-        self.teller = Teller(
-            self.autopilot_link, self.estimator, clock, self.log, AutopilotOptions()
-        )
+        frames_alone = AutopilotOptions(min_rate_hz=0.0)
+        self.teller = Teller(self.autopilot_link, self.estimator, clock, self.log, frames_alone)
         self.saved = SavedMap(
             self.maps, self.exchange.go_back_to, self.estimator, executor, self.autopilot_link,
             self.log,
