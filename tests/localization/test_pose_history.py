@@ -246,3 +246,14 @@ def test_states_come_in_order() -> None:
         history.append(started(fixes[0], 0, None, OPTIONS), fixes[0], None)
     with pytest.raises(ValueError, match="length_s"):
         PoseHistory(0.0, OPTIONS)
+
+
+def test_the_last_state_before_an_instant_is_found_wherever_that_lies() -> None:
+    history, _ = flown(np.random.default_rng(8), 4)
+    for at_ns, k in ((3 * FRAME_NS + 70, 3), (3 * FRAME_NS, 3), (3 * FRAME_NS - 1, 2), (0, 0)):
+        before = history.before(at_ns)
+        assert before is not None
+        assert before.at_ns == k * FRAME_NS
+    assert history.before(-1) is None
+    history.clear()
+    assert history.before(FRAME_NS) is None
