@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from tests.daemon import demo
-from tests.daemon.swarm import Drone, swarm
-from tests.daemon.waiting import computed, passes, run, until
+from tests.daemon.swarm import Drone, Swarm, swarm
+from tests.daemon.waiting import computed, passes, passes_until, run, until
 from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
 
 SAVE, RELOAD = 31011, 31012
@@ -94,6 +94,54 @@ def test_a_reload_goes_back_to_the_saved_map_and_looks_for_the_drone_anew(tmp_pa
             await one.fly(4)
             assert one.estimator.is_localized(one.clock.now_ns())
             assert one.estimator.n_resets == n_resets + 1  # the autopilot is told of a jump
+
+    run(scenario())
+
+
+async def gone_on(members: Swarm, path: Path) -> tuple[Drone, Drone]:
+    """Start two drones that have saved their first map, and fly on the next revision."""
+    drones = []
+    for system_id in (1, 2):
+        place = path / str(system_id)
+        place.mkdir()
+        (place / SAVED).write_bytes(MAP)
+        drones.append(await members.start(system_id, directory=str(place)))
+    one, two = drones
+    await computed(lambda: one.revision == two.revision == revision_of(MAP))
+    for drone in drones:
+        drone.maps.replace(NEXT, demo.update_index())
+        await drone.see(demo.frame(drone.system_id, 0))
+    await passes(3.0)
+    return one, two
+
+
+def test_drones_that_all_go_back_stay_there(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            one, two = await gone_on(members, tmp_path)
+            assert one.revision == two.revision == revision_of(NEXT)
+            done = [asyncio.create_task(answered(drone, RELOAD)) for drone in (one, two)]
+            await computed(lambda: all(task.done() for task in done))
+            assert [task.result() for task in done] == [ACCEPTED, ACCEPTED]
+            for _ in range(60):
+                await passes(1.0)
+                assert one.revision == two.revision == revision_of(MAP)
+
+    run(scenario())
+
+
+def test_a_drone_that_goes_back_alone_is_given_the_others_map_again(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            one, two = await gone_on(members, tmp_path)
+            done = asyncio.create_task(answered(two, RELOAD))
+            await computed(done.done)
+            assert (done.result(), two.revision) == (ACCEPTED, revision_of(MAP))
+            # Not at once: the others may be about to go back as well.
+            await passes(25.0)
+            assert two.revision == revision_of(MAP)
+            await passes_until(lambda: two.revision == revision_of(NEXT), at_most_s=400.0)
+            assert one.revision == revision_of(NEXT)
 
     run(scenario())
 
