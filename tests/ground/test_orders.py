@@ -121,7 +121,7 @@ def test_all_that_are_heard_are_asked_and_followed_to_the_end() -> None:
 @pytest.mark.parametrize(
     ("result", "text"),
     [
-        (BUSY, "has no map yet"),
+        (BUSY, "has no map yet, or is at another order"),
         (DENIED, "refuses"),
         (UNSUPPORTED, "does not know the command"),
         (FAILED, "no update came of it"),

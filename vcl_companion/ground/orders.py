@@ -65,7 +65,7 @@ class Order:
     cancelled_by: float | None = None
 
 
-_NO_MAP = "has no map yet"
+_NO_MAP = "has no map yet, or is at another order"
 ORDERS = {
     "update-map": Order(
         UPDATE_MAP, 0.0, "has a new map", "no update came of it", _NO_MAP, cancelled_by=1.0
