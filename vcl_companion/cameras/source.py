@@ -20,6 +20,9 @@ OakSocket = Literal["CAM_A", "CAM_B", "CAM_C"]
 
 SourceKind = Literal["v4l2", "oak", "stream", "recording"]
 
+# Who writes millimetres is told.
+_MAX_LEVER_ARM_M = 10.0
+
 _FORMS: dict[SourceKind, str] = {
     "v4l2": "v4l2:DEVICE",
     "oak": "oak or oak:DEVICE-ID",
@@ -92,6 +95,10 @@ class CameraOptions:
             (a calibration tool's camera time offset; V4L2 devices stamp the start
             of the exposure or the end of the readout). Devices only.
         oak_socket: the OAK's sensor: ``CAM_A`` colour, ``CAM_B`` left, ``CAM_C`` right.
+        mounting_deg: roll, pitch, yaw of the camera's housing in the body, degrees, instead of
+            the rotation in the calibration's ``T_BS``; (0, 0, 0) looks forward, images upright.
+        position_m: where the camera is, from the autopilot's IMU, m, forward, right, down,
+            instead of the translation in ``T_BS``.
     """
 
     source: str = "v4l2:/dev/video0"
@@ -100,6 +107,8 @@ class CameraOptions:
     pixel_format: PixelFormat = "auto"
     time_offset_s: float = 0.0
     oak_socket: OakSocket = "CAM_B"
+    mounting_deg: tuple[float, float, float] | None = None
+    position_m: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         parse_source(self.source)
@@ -109,6 +118,13 @@ class CameraOptions:
             raise ConfigError(f"rate_hz: must be in 0..240, got {self.rate_hz}")
         if not (math.isfinite(self.time_offset_s) and abs(self.time_offset_s) <= 1.0):
             raise ConfigError(f"time_offset_s: must be in -1..1, got {self.time_offset_s}")
+        if self.mounting_deg and not all(abs(angle) <= 360.0 for angle in self.mounting_deg):
+            raise ConfigError(f"mounting_deg: must be in -360..360, got {list(self.mounting_deg)}")
+        if self.position_m and not all(abs(m) <= _MAX_LEVER_ARM_M for m in self.position_m):
+            raise ConfigError(
+                f"position_m: must be in -{_MAX_LEVER_ARM_M:g}..{_MAX_LEVER_ARM_M:g}, metres from "
+                f"the autopilot's IMU, got {list(self.position_m)}"
+            )
 
 
 def parse_source(source: str) -> tuple[SourceKind, str]:

@@ -17,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from vcl_companion.cameras.mounting import mounting_text, read_calibration
 from vcl_companion.cameras.open import open_camera
 from vcl_companion.clock import Clock, ManualClock, SystemClock
 from vcl_companion.config import Config
@@ -51,7 +52,6 @@ from vcl_companion.errors import VclError
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.peers import PeerLink, open_signing
 from vcl_companion.localization.pipeline import PipelineOptions
-from vcl_companion.recording.sensor import read_sensor
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.transfer import Transfers
 from vcl_companion.wire.warm_up import warm_up
@@ -109,7 +109,8 @@ async def _run(config: Config) -> int:
     for number in _END_SIGNALS:
         signal.signal(number, end)
     clock: Clock = ManualClock() if config.clock == "camera" else SystemClock()
-    sensor = read_sensor(Path(config.camera.calibration))
+    sensor = read_calibration(config.camera)
+    _log.info("the camera's %s", mounting_text(sensor.body_from_cam.rotation))
     log = FlightLog(config.log.flight_log, clock)
     maps = MapStore(config.map.directory)
     signing = open_signing(config.peers)

@@ -13,12 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from vcl_companion.cameras.mounting import mounting_text, read_calibration
 from vcl_companion.cameras.open import open_camera
+from vcl_companion.cameras.source import CameraOptions
 from vcl_companion.clock import Clock
 from vcl_companion.config import Config
 from vcl_companion.errors import VclError
 from vcl_companion.links.key_file import read_key_file
-from vcl_companion.recording.sensor import read_sensor
 
 Grade = Literal["ok", "warning", "failure"]
 
@@ -51,7 +52,7 @@ class Check:
 
 def of_files(config: Config) -> Iterable[Check]:
     """Look at calibration, key, disk."""
-    yield _of_calibration(Path(config.camera.calibration))
+    yield _of_calibration(config.camera)
     if config.peers.key_file:
         try:
             key = read_key_file(Path(config.peers.key_file))
@@ -73,14 +74,15 @@ def of_files(config: Config) -> Iterable[Check]:
         yield Check("disk", grade, f"{free / 1e6:.0f} MB free for {folder}", advice)
 
 
-def _of_calibration(path: Path) -> Check:
+def _of_calibration(options: CameraOptions) -> Check:
     try:
-        sensor = read_sensor(path)
-        age_s = time.time() - os.stat(path)[stat.ST_MTIME]
+        sensor = read_calibration(options)
+        age_s = time.time() - os.stat(options.calibration)[stat.ST_MTIME]
     except (VclError, OSError) as error:
         return Check("calibration", "failure", str(error), "camera.calibration names a sensor.yaml")
     camera = sensor.camera
-    what = f"{camera.width_px}x{camera.height_px}, {age_s / 86400.0:.0f} days old"
+    what = f"{camera.width_px}x{camera.height_px}, {age_s / 86400.0:.0f} days old, "
+    what += mounting_text(sensor.body_from_cam.rotation)
     if age_s > _YEAR_S:
         return Check("calibration", "warning", what, "lenses move: calibrate anew")
     return Check("calibration", "ok", what)
@@ -100,7 +102,7 @@ async def of_camera(config: Config, clock: Clock) -> Check:
     times: list[int] = []
     means: list[float] = []
     try:
-        camera = open_camera(config.camera, read_sensor(Path(config.camera.calibration)), clock)
+        camera = open_camera(config.camera, read_calibration(config.camera), clock)
         try:
             with suppress(TimeoutError):
                 async with asyncio.timeout(_CAMERA_S):

@@ -84,12 +84,21 @@ def nominal_rate_hz(at_ns: Sequence[int]) -> float:
     return float(f"{min(max(1e9 / interval_ns, 1e-3), 1e5):.6g}")
 
 
-def read_sensor(path: Path, default_axes: ReferenceAxes = "NED") -> Sensor:
+def read_sensor(
+    path: Path,
+    default_axes: ReferenceAxes = "NED",
+    *,
+    rotation: Array | None = None,
+    position_m: Array | None = None,
+) -> Sensor:
     """Read a camera's ``sensor.yaml``.
 
     Args:
         path: the file.
         default_axes: what holds when the file does not say ``reference_axes``.
+        rotation: (3, 3) body_from_cam that takes the place of that in ``T_BS``; then the file
+            need not have it, and the camera sits at the body's origin unless it is said.
+        position_m: (3,) the camera's place in the body, m, instead of that in ``T_BS``.
 
     Raises:
         RecordingError: it is absent or cannot be used; one line with file and key.
@@ -113,8 +122,16 @@ def read_sensor(path: Path, default_axes: ReferenceAxes = "NED") -> Sensor:
         if not (1 <= size <= _MAX_IMAGE_PX and size == int(size)):
             raise RecordingError(f"{path}: resolution {width:g} x {height:g} is not an image size")
     body_from_cam = read_extrinsics(path, fields)
+    if rotation is not None:
+        there = np.zeros(3) if body_from_cam is None else body_from_cam.translation
+        body_from_cam = Pose(rotation, there)
     if body_from_cam is None:
-        raise RecordingError(f"{path}: T_BS is missing; add the 4x4 matrix body_from_cam")
+        raise RecordingError(
+            f"{path}: T_BS is missing; add the 4x4 matrix body_from_cam, or set "
+            "[camera] mounting_deg in the configuration"
+        )
+    if position_m is not None:
+        body_from_cam = Pose(body_from_cam.rotation, position_m)
     try:
         return Sensor(
             Camera(int(width), int(height), fx, fy, cx, cy, distortion_model, distortion),
