@@ -36,8 +36,9 @@ from vcl_companion.daemon.settings import open_settings
 from vcl_companion.daemon.teller import Teller
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import exp_so3
 from vcl_companion.links.autopilot import AutopilotLink
-from vcl_companion.links.autopilot_options import AutopilotOptions
+from vcl_companion.links.autopilot_options import AutopilotOptions, Heading
 from vcl_companion.links.counters import LinkCounters
 from vcl_companion.links.key_file import make_key_file
 from vcl_companion.links.messages import Tunnel
@@ -90,8 +91,11 @@ class Drone:
         update: UpdateOptions,
         seed: int,
         directory: str = "",
+        north_deg: float = 0.0,
+        heading: Heading = "map",
     ) -> None:
         self.system_id = system_id
+        self._north = Pose(exp_so3(np.deg2rad([0.0, 0.0, north_deg])), np.zeros(3))
         self.autopilot, self.autopilot_link = autopilot
         self.clock = clock
         self._log_path = log_path
@@ -99,8 +103,9 @@ class Drone:
         self.maps = MapStore(directory)
         self.requests: list[FrameRequest] = []
         self.estimator = Estimator(
-            FilterOptions(), LocalizationOptions(), lambda why: self.log.event("jump", why)
-        )
+            FilterOptions(), LocalizationOptions(), lambda why: self.log.event("jump", why),
+            heading=heading,
+        )  # fmt: skip
         swarm = SwarmOptions(members, demo.LEADER, demo.known_distances(1, 2))
         rng = np.random.default_rng(seed)
         self.group = Group(swarm, system_id)
@@ -232,7 +237,7 @@ class Flyer(Drone):
         """Hand out the k-th picture, its attitude first; do not wait for its answer."""
         await self.camera.connected()
         shot = demo.shot(self.system_id, k)
-        self.autopilot.measure(shot.at_ns, shot.ned_from_body.quaternion())
+        self.autopilot.measure(shot.at_ns, (self._north @ shot.ned_from_body).quaternion())
         self.camera.give(self.camera.n_given, shot.at_ns, demo.png(shot.image))
 
     async def fly(self, k: int) -> None:
@@ -369,10 +374,21 @@ class Swarm:
         transfer: TransferOptions = FAST,
         update: UpdateOptions = NO_UPDATES,
         directory: str = "",
+        north_deg: float = 0.0,
+        heading: Heading = "map",
     ) -> Flyer:
-        """Start a drone that flies; see ``_start``."""
+        """Start a drone that flies, its autopilot's north turned by so much; see ``_start``."""
         return await self._start(
-            Flyer, system_id, flies_on, transfer, INTER, update, True, directory
+            Flyer,
+            system_id,
+            flies_on,
+            transfer,
+            INTER,
+            update,
+            True,
+            directory,
+            north_deg,
+            heading,
         )
 
     async def _start(
@@ -385,6 +401,8 @@ class Swarm:
         update: UpdateOptions,
         runs: bool,
         directory: str,
+        north_deg: float = 0.0,
+        heading: Heading = "map",
     ) -> _Kind:
         """Start a drone at the instant of its first frame, flying on the map of some if given."""
         life = await self._stack.enter_async_context(contextlib.AsyncExitStack())
@@ -393,14 +411,15 @@ class Swarm:
         shot = demo.shot(system_id)
         clock = ManualClock(shot.at_ns)
         executor = life.enter_context(Worker("beside"))
-        quaternion = shot.ned_from_body.quaternion()
+        north = Pose(exp_so3(np.deg2rad([0.0, 0.0, north_deg])), np.zeros(3))
+        quaternion = (north @ shot.ned_from_body).quaternion()
         autopilot = await life.enter_async_context(
             autopilot_and_link(system_id, clock, shot.at_ns, quaternion)
         )
         log_path = self._path / f"{system_id}-{self._n_started}.jsonl"
         drone = kind(
             system_id, self._members, self._peers(system_id), autopilot, clock, executor,
-            log_path, transfer, inter, update, self._n_started, directory,
+            log_path, transfer, inter, update, self._n_started, directory, north_deg, heading,
         )  # fmt: skip
         life.callback(drone.close)
         if flies_on:

@@ -28,7 +28,7 @@ def believed(drone: Drone) -> Pose:
     """Where the autopilot is told that a drone is, at the instant of its clock."""
     state = drone.estimator.predicted(drone.clock.now_ns(), None)
     assert state is not None
-    return drone.estimator.local_from_world @ state.world_from_body
+    return drone.estimator.local.from_world @ state.world_from_body
 
 
 def told_of(*drones: Drone) -> bool:
@@ -64,7 +64,7 @@ def test_a_map_of_another_world_is_merged_and_its_drone_goes_on_where_it_was(
             assert np.abs(off).max() < 1e-9
             assert three.estimator.n_resets == 0
             # The new world is not where the old one was, or this test shows nothing.
-            moved = three.estimator.local_from_world
+            moved = three.estimator.local.from_world
             assert np.abs(Pose.identity().local(moved)).max() > 1e-6
 
     run(scenario())
@@ -102,7 +102,7 @@ def test_what_both_parts_of_a_swarm_have_seen_meanwhile_is_kept(tmp_path: Path) 
             seen = {(k.drone_id, k.captured_at_ns) for k in merged.index.landmark_map.keyframes}
             assert {(3, demo.shot(3, k).at_ns) for k in (6, 12)} <= seen
             assert not three.events("world")  # it is the same
-            assert np.abs(Pose.identity().local(three.estimator.local_from_world)).max() == 0.0
+            assert np.abs(Pose.identity().local(three.estimator.local.from_world)).max() == 0.0
 
     run(scenario())
 

@@ -128,6 +128,7 @@ async def _run(config: Config) -> int:
         config.localization,
         lambda why: log.event("jump", why),
         keeps_local=config.swarm.keeps_local,
+        heading=config.autopilot.heading,
     )
     vision = Worker("vision")
     # Before anybody is told that we are here: no frame has to wait for the compiler.

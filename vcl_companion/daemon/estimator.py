@@ -9,9 +9,11 @@ from contextlib import suppress
 
 import numpy as np
 
+from vcl_companion.daemon.local_frame import LocalFrame
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.geometry.similarity import Similarity
+from vcl_companion.links.autopilot_options import Heading
 from vcl_companion.localization.intra import (
     LocalizationOptions,
     Localized,
@@ -51,6 +53,7 @@ class Estimator:
         jumped: told of a jump, and of what made it.
         keeps_local: whether the autopilot goes on being told poses in the frame that it knows
             when our map's world is left; else it is told the other world's, a jump.
+        heading: whose north that frame has (``LocalFrame``).
     """
 
     def __init__(
@@ -60,6 +63,7 @@ class Estimator:
         jumped: Callable[[str], None],
         *,
         keeps_local: bool = True,
+        heading: Heading = "map",
     ) -> None:
         self._keeps_local = keeps_local
         self._options = options
@@ -72,8 +76,8 @@ class Estimator:
         self._looked_at_ns = -1
         self._looked = asyncio.Event()
         self.n_resets = 0
-        self.local_from_world = Pose.identity()
-        """From the map's world to the frame that the autopilot is told poses in."""
+        self.local = LocalFrame(heading)
+        """The frame that the autopilot is told poses in."""
         self.tracked = 0
         """Landmarks of the map that the last frame showed; 0 when it was refused."""
         self.covered = 0.0
@@ -291,8 +295,8 @@ class Estimator:
     def carry(self, other_from_world: Similarity) -> None:
         """Go on in another world, whose map takes the place of ours.
 
-        Where the autopilot takes us to be does not change by it, if it is to be so:
-        ``local_from_world`` does.
+        Where the autopilot takes us to be does not change by it, if it is to be so: where its
+        frame is in the world does.
         What is still to come of earlier frames is of the world that was left, and not taken.
         """
         newest = self._history.newest
@@ -305,8 +309,9 @@ class Estimator:
             was = Pose.identity()
             now = other_from_world.of_pose(was)
         if self._keeps_local:
-            self.local_from_world = self.local_from_world @ was @ now.inverse()
+            self.local.carry(was, now)
         else:
+            self.local.leave()
             self._jump("joined another world")
         if self._own_fix is not None:
             self._own_fix = carried(self._own_fix, other_from_world)

@@ -170,7 +170,10 @@ class Teller:
         """
         if self._autopilot.is_paused:
             return "paused by the ground"
-        local_from_world = self._estimator.local_from_world
+        local = self._estimator.local
+        if not local.settles(state):
+            return "the autopilot has not said its heading"
+        local_from_world = local.from_world
         pose = local_from_world @ state.world_from_body
         covariance, velocity = state.pose_covariance(), state.velocity_covariance()
         if share is None:

@@ -9,6 +9,8 @@ from typing import Literal
 from vcl_companion.errors import ConfigError
 from vcl_companion.links.transport import check_allowed_senders, parse_link
 
+Heading = Literal["map", "autopilot"]
+
 
 class ServiceState(enum.Enum):
     """What the heartbeat says of us, as MAV_STATE; STALLED says nothing at all."""
@@ -49,6 +51,9 @@ class AutopilotOptions:
         blend_speed_m_s: of a slide.
         blend_turn_deg_s: of a slide's heading.
         propagate_s: how long after the last frame with a pose one is told between frames.
+        heading: whose north poses are told in: ``map``, the leader's at the first map, for an
+            autopilot that takes its heading from us; ``autopilot``, its own at the first pose,
+            for one that flies by its compass.
     """
 
     link: str = "serial:/dev/serial0:921600"
@@ -67,6 +72,7 @@ class AutopilotOptions:
     resets: Literal["follow", "blend", "wait"] = "follow"
     blend_speed_m_s: float = 0.3
     blend_turn_deg_s: float = 5.0
+    heading: Heading = "map"
 
     def __post_init__(self) -> None:
         parse_link(self.link)

@@ -1,0 +1,68 @@
+"""The frame that the autopilot is told poses in: the world's origin, the world's north or its own.
+
+World's north is that of the leader's autopilot at the first map. An autopilot that takes its
+heading from us turns to it. One that flies by its compass keeps its own, and takes what it is told
+along the axes of another for motion that its inertial sensors do not feel: it has to be told
+positions turned to its north.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array, exp_so3
+from vcl_companion.links.autopilot_options import Heading
+from vcl_companion.localization.pose_filter import FilterState
+
+_log = logging.getLogger(__name__)
+
+
+class LocalFrame:
+    """Where that frame is in the map's world; both have one origin until a world is left.
+
+    Args:
+        heading: whose north it has: ``map``, the world's, or ``autopilot``, the autopilot's own
+            as it is when the first pose is told.
+    """
+
+    def __init__(self, heading: Heading) -> None:
+        self._heading = heading
+        self.from_world = Pose.identity()
+        """local_from_world, once it is settled."""
+        self.is_settled = heading == "map"
+
+    @property
+    def origin_world(self) -> Array | None:
+        """(3,) its origin in the world, m; None until it is settled."""
+        return self.from_world.inverse().translation if self.is_settled else None
+
+    def settles(self, state: FilterState) -> bool:
+        """Whether poses can be told: with the autopilot's own north not before it has told it."""
+        if not self.is_settled and state.ned_from_body is not None:
+            ned_from_world = state.world_from_ned.T
+            # The turn about the vertical that is nearest to it: tilt errors have no part in it.
+            north_rad = math.atan2(
+                ned_from_world[1, 0] - ned_from_world[0, 1],
+                ned_from_world[0, 0] + ned_from_world[1, 1],
+            )
+            turn = exp_so3(np.array([0.0, 0.0, north_rad]))
+            self.from_world = Pose(turn, np.zeros(3))
+            self.is_settled = True
+            _log.info(
+                "the map's north is at %.1f degrees by the autopilot", math.degrees(north_rad)
+            )
+        return self.is_settled
+
+    def carry(self, was: Pose, now: Pose) -> None:
+        """Stay where it is while the world becomes another, in which ``was`` is ``now``."""
+        if self.is_settled:
+            self.from_world = self.from_world @ was @ now.inverse()
+
+    def leave(self) -> None:
+        """Begin anew in another world, at its origin."""
+        self.from_world = Pose.identity()
+        self.is_settled = self._heading == "map"
