@@ -17,6 +17,7 @@ RECORDING_FOLDER = "recording"
 _MARK = Path("run") / "flight.json"
 _OWN_FILES = (
     *("estimate.tum", "covariance.csv", "truth.tum", "received.jsonl", "attitude.csv"),
+    "global.csv",
     *(FUSED_FILE, SAID_FILE, COMMANDED_FILE),
 )
 _OWN_REPORTS = ("report.json", "report.html")

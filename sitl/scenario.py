@@ -21,11 +21,11 @@ from sitl.mission import Mission
 from sitl.renderer import Imaging
 from sitl.town import Town
 from sitl.trajectories import Flight, FlightPath
+from vcl_companion.cameras.mounting import mounted_rotation
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.camera import Camera, DistortionModel
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import matrix_from_euler
-from vcl_companion.recording import BODY_FROM_CAM_FORWARD, Sensor
+from vcl_companion.recording import Sensor
 
 SCENARIOS = Path(__file__).resolve().parent / "scenarios"
 
@@ -74,9 +74,8 @@ class Lens(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def body_from_cam(self, tilt_deg: float = 0.0) -> Pose:
         """Return where the camera sits, looking higher by a tilt."""
-        roll, pitch, yaw = np.deg2rad(self.roll_pitch_yaw_deg).tolist()
-        turn = matrix_from_euler(roll, pitch + float(np.deg2rad(tilt_deg)), yaw)
-        return Pose(turn @ BODY_FROM_CAM_FORWARD, np.array(self.position_m))
+        roll, pitch, yaw = self.roll_pitch_yaw_deg
+        return Pose(mounted_rotation((roll, pitch + tilt_deg, yaw)), np.array(self.position_m))
 
 
 class Picture(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

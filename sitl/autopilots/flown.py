@@ -206,6 +206,7 @@ class Flown:
             for wanted, interval_us in (
                 (dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, _STREAM_US),
                 (dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, _STREAM_US),
+                (dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, _ESTIMATOR_US),
                 (self._firmware.estimator_message, _ESTIMATOR_US),
             ):
                 messages.append(

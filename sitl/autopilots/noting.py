@@ -1,7 +1,9 @@
 """What a real firmware says of itself, written down for the report.
 
 ``attitude.csv``, where its nose points (ATTITUDE_QUATERNION); ``fused.csv``, where it believes to
-be (``at_ns,x,y,z`` of LOCAL_POSITION_NED); ``said.csv``, its texts and its estimator's flags.
+be (``at_ns,x,y,z`` of LOCAL_POSITION_NED); ``global.csv``, where on Earth, once it knows
+(``at_ns,latitude_deg,longitude_deg,altitude_m`` of GLOBAL_POSITION_INT); ``said.csv``, its texts
+and its estimator's flags.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ class Noting:
 
         self._attitudes = opened("attitude.csv", "at_ns,qw,qx,qy,qz\n")
         self._fused = opened("fused.csv", "at_ns,x,y,z\n")
+        self._places = opened("global.csv", "at_ns,latitude_deg,longitude_deg,altitude_m\n")
         self._texts = opened("said.csv", "at_ns,severity,text\n")
         self._flags = -1
         self.clock_ahead_ns: int | None = None
@@ -57,3 +60,8 @@ class Noting:
         elif kind == "LOCAL_POSITION_NED":
             at_ns = message.time_boot_ms * 1_000_000 - self.clock_ahead_ns
             self._fused.write(f"{at_ns},{message.x!r},{message.y!r},{message.z!r}\n")
+        elif kind == "GLOBAL_POSITION_INT" and (message.lat or message.lon):
+            at_ns = message.time_boot_ms * 1_000_000 - self.clock_ahead_ns
+            latitude_deg, longitude_deg = message.lat * 1e-7, message.lon * 1e-7
+            place = f"{latitude_deg:.7f},{longitude_deg:.7f},{message.alt * 1e-3:.3f}"
+            self._places.write(f"{at_ns},{place}\n")

@@ -57,6 +57,10 @@ PARAMETERS = {
 }
 _HEARTBEAT_S = 1.0
 _TIMESYNC_PERIOD_NS = 100_000_000
+_SET_GLOBAL_ORIGIN = 611  # not in pymavlink's dialects
+_ACCEPTED: int = dialect.MAV_RESULT_ACCEPTED
+_UNSUPPORTED: int = dialect.MAV_RESULT_UNSUPPORTED
+_FAILED: int = dialect.MAV_RESULT_FAILED
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,8 @@ class StandIn:
         self._backlog = Backlog()
         self._next_heartbeat_s = 0.0
         self._parameters = {**PARAMETERS, **options.parameters}
+        # latitude and longitude, 1e-7 degrees, altitude, mm: as ArduPilot it keeps its first
+        self._origin: tuple[int, int, int] | None = None
         self._streams = {
             dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT: self._send_estimator,
             dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: self._send_position,
@@ -225,20 +231,53 @@ class StandIn:
                     message.reset_counter,
                 )
             )
-        elif kind == "COMMAND_LONG" and message.target_system == self._options.system_id:
-            known = message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL
-            if known and int(message.param1) in self._streams and message.param2 >= 1000.0:
-                self._interval_ns[int(message.param1)] = round(1000.0 * message.param2)
+        elif (
+            kind in ("COMMAND_LONG", "COMMAND_INT", "SET_GPS_GLOBAL_ORIGIN")
+            and message.target_system == self._options.system_id
+        ):
+            if kind == "SET_GPS_GLOBAL_ORIGIN":
+                self._take_origin(message.latitude, message.longitude, message.altitude)
+                return
+            result = self._obey_int(message) if kind == "COMMAND_INT" else self._obey(message)
             self._send(
                 dialect.MAVLink_command_ack_message(
-                    message.command,
-                    dialect.MAV_RESULT_ACCEPTED if known else dialect.MAV_RESULT_UNSUPPORTED,
-                    0,
-                    0,
-                    message.get_srcSystem(),
+                    message.command, result, 0, 0, message.get_srcSystem(),
                     message.get_srcComponent(),
                 )
-            )
+            )  # fmt: skip
+
+    def _obey(self, message: Any) -> int:
+        """Obey a COMMAND_LONG; return its MAV_RESULT."""
+        wanted = int(message.param1)
+        if message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
+            if wanted in self._streams and message.param2 >= 1000.0:
+                self._interval_ns[wanted] = round(1000.0 * message.param2)
+            return _ACCEPTED
+        if message.command == dialect.MAV_CMD_REQUEST_MESSAGE:
+            if wanted != dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
+                return _FAILED
+            self._say_origin()
+            return _ACCEPTED
+        return _UNSUPPORTED
+
+    def _obey_int(self, message: Any) -> int:
+        """Obey a COMMAND_INT; return its MAV_RESULT."""
+        if message.command != _SET_GLOBAL_ORIGIN:
+            return _UNSUPPORTED
+        is_taken = self._take_origin(message.x, message.y, round(1e3 * message.z))
+        return _ACCEPTED if is_taken else _FAILED
+
+    def _take_origin(self, latitude: int, longitude: int, altitude: int) -> bool:
+        """Keep an origin, unless there is one; whether it is kept."""
+        if self._origin is not None:
+            return False
+        self._origin = (latitude, longitude, altitude)
+        self._say_origin()
+        return True
+
+    def _say_origin(self) -> None:
+        if self._origin is not None:
+            self._send(dialect.MAVLink_gps_global_origin_message(*self._origin))
 
     def _boot_ns(self) -> int:
         assert self._now_ns is not None

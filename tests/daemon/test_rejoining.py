@@ -12,10 +12,12 @@ from tests.daemon import demo
 from tests.daemon.swarm import Drone, swarm
 from tests.daemon.waiting import computed, hurry, run, until
 from vcl_companion.daemon.feature_memory import FeatureMemory
+from vcl_companion.daemon.local_frame import origin_in_leaders_world
 from vcl_companion.daemon.map_branches import way_into
 from vcl_companion.daemon.map_building import update_map
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.map_index import index_map
 from vcl_companion.mapping.drone_view import encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
@@ -29,6 +31,11 @@ def believed(drone: Drone) -> Pose:
     state = drone.estimator.predicted(drone.clock.now_ns(), None)
     assert state is not None
     return drone.estimator.local.from_world @ state.world_from_body
+
+
+def begins(drone: Drone) -> Array | None:
+    """Where the frame begins that its autopilot is told poses in, in the leader's world."""
+    return origin_in_leaders_world(drone.estimator.local, drone.group, drone.maps.current)
 
 
 def told_of(*drones: Drone) -> bool:
@@ -49,6 +56,8 @@ def test_a_map_of_another_world_is_merged_and_its_drone_goes_on_where_it_was(
             three = await members.start(3, flies_on=(1, 2, 3))
             three.track(50)
             before = believed(three)
+            # Of its own world nobody has said where it is.
+            assert begins(three) is None
             await until(lambda: told_of(one, two, three))
             hurry(6.0)  # the coordinator has not sent one of its own by then
             await computed(lambda: one.revision not in (b"", revision_of(PAIR)))
@@ -66,6 +75,15 @@ def test_a_map_of_another_world_is_merged_and_its_drone_goes_on_where_it_was(
             # The new world is not where the old one was, or this test shows nothing.
             moved = three.estimator.local.from_world
             assert np.abs(Pose.identity().local(moved)).max() > 1e-6
+            # Where its autopilot's frame begins in the leader's: a place in the one plus what
+            # it is told there is the place in the other.
+            assert three.group.leader == 1
+            await until(lambda: begins(three) is not None)
+            origin = begins(three)
+            assert origin is not None
+            np.testing.assert_allclose(moved.inverse().apply(np.zeros(3)), origin)
+            np.testing.assert_array_equal(begins(one), np.zeros(3))
+            np.testing.assert_array_equal(begins(two), np.zeros(3))
 
     run(scenario())
 

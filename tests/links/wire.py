@@ -6,6 +6,7 @@ from typing import Any
 
 # message id: CRC_EXTRA, https://mavlink.io/en/messages/ardupilotmega.html
 HEARTBEAT, ATTITUDE, ATTITUDE_QUATERNION, COMMAND_LONG, COMMAND_ACK = 0, 30, 31, 76, 77
+LOCAL_POSITION_NED, SET_GPS_GLOBAL_ORIGIN, GPS_GLOBAL_ORIGIN, COMMAND_INT = 32, 48, 49, 75
 PARAM_REQUEST_READ, PARAM_REQUEST_LIST, PARAM_VALUE, PARAM_SET = 20, 21, 22, 23
 AUTOPILOT_VERSION, MESSAGE_INTERVAL, ONBOARD_COMPUTER_STATUS = 148, 244, 390
 VISION_POSITION_ESTIMATE, TIMESYNC, STATUSTEXT, ODOMETRY, TUNNEL = 102, 111, 253, 331, 385
@@ -13,6 +14,10 @@ CRC_EXTRA = {
     HEARTBEAT: 50,
     ATTITUDE: 39,
     ATTITUDE_QUATERNION: 246,
+    LOCAL_POSITION_NED: 185,
+    SET_GPS_GLOBAL_ORIGIN: 41,
+    GPS_GLOBAL_ORIGIN: 39,
+    COMMAND_INT: 158,
     COMMAND_LONG: 152,
     PARAM_REQUEST_READ: 214,
     PARAM_REQUEST_LIST: 159,
@@ -33,6 +38,11 @@ LAYOUT = {
     HEARTBEAT: struct.Struct("<IBBBBB"),  # custom_mode type autopilot base_mode status version
     ATTITUDE: struct.Struct("<I6f"),
     ATTITUDE_QUATERNION: struct.Struct("<I7f4f"),
+    LOCAL_POSITION_NED: struct.Struct("<I6f"),
+    SET_GPS_GLOBAL_ORIGIN: struct.Struct("<iiiB"),  # latitude longitude altitude system
+    GPS_GLOBAL_ORIGIN: struct.Struct("<iii"),
+    # four parameters, x y z, command, its target, frame, current, autocontinue
+    COMMAND_INT: struct.Struct("<4fiifHBBBBB"),
     COMMAND_LONG: struct.Struct("<7fHBBB"),
     PARAM_REQUEST_READ: struct.Struct("<hBB16s"),
     PARAM_REQUEST_LIST: struct.Struct("<BB"),

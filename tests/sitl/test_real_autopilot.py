@@ -51,10 +51,18 @@ def motion() -> RecordedMotion:
 class Flight:
     """The firmware, our link to it, and a drone that knows where it is."""
 
-    def __init__(self, autopilot: Flown, port: int, true: RecordedMotion) -> None:
+    def __init__(
+        self,
+        autopilot: Flown,
+        port: int,
+        true: RecordedMotion,
+        origin: tuple[float, float, float] | None,
+    ) -> None:
         self.clock = ManualClock(START_NS)
-        options = AutopilotOptions(link=f"udp:127.0.0.1:{port}")
+        options = AutopilotOptions(link=f"udp:127.0.0.1:{port}", origin=origin)
         self.link = AutopilotLink(options, SYSTEM, self.clock)
+        self.origin_world: Array | None = None
+        self.link.origin.origin_world = lambda: self.origin_world
         self.off = np.zeros(3)
         self.n_resets = 0
         self.states: list[FusionState] = []
@@ -85,6 +93,10 @@ class Flight:
         )
         assert self.link.send_pose(estimate) is None
 
+    def true_at(self, at_ns: int) -> Array:
+        """Return (3,) where it was."""
+        return np.asarray(self._true.at(np.array([at_ns], dtype=np.int64)).positions_m[0])
+
     def apart_m(self, fused: Path) -> Array:
         """Return (T,) how far it was from where it was told to be, in the last second."""
         rows = [line.split(",") for line in fused.read_text().splitlines()[-60:]]
@@ -95,7 +107,11 @@ class Flight:
         return np.asarray(np.linalg.norm(believed[lately] - told, axis=1))
 
 
-def flown(tmp_path: Path, scenario: Callable[[Flight, Path], Coroutine[None, None, None]]) -> None:
+def flown(
+    tmp_path: Path,
+    scenario: Callable[[Flight, Path], Coroutine[None, None, None]],
+    origin: tuple[float, float, float] | None = None,
+) -> None:
     true = motion()
     out = tmp_path / "mav1"
     options = FirmwareOptions(
@@ -108,7 +124,7 @@ def flown(tmp_path: Path, scenario: Callable[[Flight, Path], Coroutine[None, Non
         autopilot.advance_to(START_NS)
 
         async def run() -> None:
-            flight = Flight(autopilot, udp.getsockname()[1], true)
+            flight = Flight(autopilot, udp.getsockname()[1], true, origin)
             async with asyncio.timeout(120.0):
                 link = asyncio.ensure_future(flight.link.run())
                 try:
@@ -169,3 +185,50 @@ def test_vision_that_returns_after_half_a_minute_is_fused_again(tmp_path: Path) 
         assert flight.apart_m(fused).max() < 0.15
 
     flown(tmp_path, scenario)
+
+
+def test_told_its_origin_before_poses_it_knows_its_global_position_by_them(tmp_path: Path) -> None:
+    origin = (47.397742, 8.545594, 488.0)
+
+    async def scenario(flight: Flight, fused: Path) -> None:
+        places, heard = (fused.with_name(name) for name in ("global.csv", "received.jsonl"))
+        # Another drone's local frame: 30 m north, 20 m west and 2 m above of the leader's.
+        flight.origin_world = np.array([30.0, -20.0, -2.0])
+        assert places.read_text() == ""
+        while "VCL origin set" not in heard.read_text():
+            assert flight.clock.now_ns() < START_NS + 15_000_000_000
+            await flight.fly(1.0, sends=False)
+        await flight.fly(2.0)
+        assert flight.link.fusion().state is FusionState.FUSED
+        await flight.fly(10.0)
+        assert flight.states == [FusionState.FUSED]
+        assert flight.apart_m(fused).max() < 0.1
+        at_ns, latitude, longitude, altitude = map(
+            float, places.read_text().splitlines()[-1].split(",")
+        )
+        there = flight.true_at(round(at_ns)) + flight.origin_world
+        metres_per_deg = 111_318.845  # by LOCATION_SCALING_FACTOR
+        off_m = [
+            (latitude - origin[0]) * metres_per_deg - there[0],
+            (longitude - origin[1]) * metres_per_deg * np.cos(np.deg2rad(origin[0])) - there[1],
+            altitude - origin[2] + there[2],
+        ]
+        assert np.abs(off_m).max() < 0.3, off_m
+
+    flown(tmp_path, scenario, origin)
+
+
+def test_an_origin_that_would_throw_its_height_waits(tmp_path: Path) -> None:
+    async def scenario(flight: Flight, fused: Path) -> None:
+        heard = fused.with_name("received.jsonl")
+        await flight.fly(10.0)
+        flight.origin_world = np.zeros(3)
+        while "VCL origin waits until armed" not in heard.read_text():
+            assert flight.clock.now_ns() < START_NS + 40_000_000_000
+            await flight.fly(1.0)
+        await flight.fly(5.0)
+        assert flight.states == [FusionState.FUSED]
+        assert flight.apart_m(fused).max() < 0.1
+        assert '"COMMAND_INT"' not in heard.read_text()
+
+    flown(tmp_path, scenario, (47.397742, 8.545594, 488.0))

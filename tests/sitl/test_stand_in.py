@@ -16,6 +16,7 @@ from mavsdk import ComponentType, Configuration, Mavsdk
 from mavsdk.plugins.mavlink_direct import MavlinkDirect
 
 from sitl.autopilots.attitude_source import AttitudeErrors, ReplayedAttitude, TruthAttitude
+from tests.daemon.waiting import until
 from tests.links.running import LONGEST_S, running, udp
 from vcl_companion.clock import ManualClock
 from vcl_companion.errors import ConfigError
@@ -315,6 +316,31 @@ def test_a_broken_trajectory_names_its_row(tmp_path: Path, row: str, why: str) -
     path.write_text("at_ns,qw,qx,qy,qz\n")
     with pytest.raises(ConfigError, match="no rows"):
         ReplayedAttitude(path)
+
+
+def test_it_keeps_the_first_origin_that_it_is_told(tmp_path: Path) -> None:
+    out = tmp_path / "mav"
+
+    async def tell(port: int, origin: tuple[float, float, float], n_texts: int) -> None:
+        options = AutopilotOptions(link=f"udp:127.0.0.1:{port}", origin=origin)
+        link = AutopilotLink(options, SYSTEM, ManualClock(START_NS))
+        link.origin.origin_world = lambda: np.zeros(3)
+        async with running(link.run()):
+            await until(lambda: len(received(out, "STATUSTEXT")) == n_texts)
+
+    async def scenario() -> None:
+        async with stand_in(out, truth(tmp_path)) as process:
+            await process.advance_to(START_NS)
+            await tell(process.port, (47.0, 8.0, 500.0), 1)
+            await tell(process.port, (47.001, 8.0, 500.0), 2)
+            await process.finish()
+
+    asyncio.run(scenario())
+    (command,) = [line["fields"] for line in received(out, "COMMAND_INT")]
+    assert (command["command"], command["x"], command["y"]) == (611, 470000000, 80000000)
+    assert command["z"] == 500.0
+    texts = "".join(line["fields"]["text"] for line in received(out, "STATUSTEXT"))
+    assert texts == "VCL origin set" + "VCL the autopilot's origin is 111 m from ours"
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from vcl_companion.daemon.exchange import Exchange, ExchangeOptions
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
+from vcl_companion.daemon.local_frame import origin_in_leaders_world
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.message_requests import MessageRequests
@@ -129,6 +130,9 @@ async def _run(config: Config) -> int:
         lambda why: log.event("jump", why),
         keeps_local=config.swarm.keeps_local,
         heading=config.autopilot.heading,
+    )
+    autopilot.origin.origin_world = lambda: origin_in_leaders_world(
+        estimator.local, group, maps.current
     )
     vision = Worker("vision")
     # Before anybody is told that we are here: no frame has to wait for the compiler.

@@ -13,10 +13,12 @@ import math
 
 import numpy as np
 
+from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3
 from vcl_companion.links.autopilot_options import Heading
 from vcl_companion.localization.pose_filter import FilterState
+from vcl_companion.swarm.group import Group
 
 _log = logging.getLogger(__name__)
 
@@ -66,3 +68,22 @@ class LocalFrame:
         """Begin anew in another world, at its origin."""
         self.from_world = Pose.identity()
         self.is_settled = self._heading == "map"
+
+
+def origin_in_leaders_world(
+    local: LocalFrame, group: Group, stored: StoredMap | None
+) -> Array | None:
+    """Return where the origin of the autopilot's frame is in the world of the leader, (3,) m.
+
+    Only of that world is it said where on Earth it is. A drone that flies in another one, a team's
+    of its own, does not know, nor does one that has not heard from the leader what it flies in.
+    Before there is a map it is the origin of the world to come: an autopilot wants its own before
+    it lets itself be armed.
+    """
+    if stored is None:
+        return np.zeros(3)
+    if group.leader != group.own_id:
+        leads = group.state_of(group.leader)
+        if leads is None or leads.world != stored.world:
+            return None
+    return local.origin_world

@@ -7,6 +7,7 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,15 +27,18 @@ from vcl_companion.links.messages import (
     ESTIMATOR_STATUS_ID,
     FRAME_LOCAL_FRD,
     FRAME_LOCAL_NED,
+    GLOBAL_ORIGIN_ID,
     LOCAL_POSITION_ID,
     ODOMETRY_ID,
     RESULT_ACCEPTED,
+    SET_GLOBAL_ORIGIN,
     SET_MESSAGE_INTERVAL,
     VISION_POSITION_ESTIMATE_ID,
     AttitudeSample,
     CommandAck,
     CommandLong,
     EstimatorStatus,
+    GlobalOrigin,
     Heartbeat,
     LocalPosition,
     Message,
@@ -43,6 +47,7 @@ from vcl_companion.links.messages import (
     ParameterValue,
     Timesync,
 )
+from vcl_companion.links.origin import GlobalPlace, OriginSetter
 from vcl_companion.links.parameters import Parameters
 from vcl_companion.links.reconnect import Address
 from vcl_companion.links.stream_requests import StreamRequests
@@ -99,8 +104,17 @@ class AutopilotLink:
         self._asked_at_s = -math.inf
         self._news = asyncio.Event()
         self._state = ServiceState.STARTING
+        self.origin = OriginSetter(
+            None if options.origin is None else GlobalPlace(*options.origin),
+            self.parameter,
+            partial(self._request, GLOBAL_ORIGIN_ID),
+            partial(self._set_origin, self._codec.command_global_origin),
+            partial(self._set_origin, self._codec.set_global_origin),
+            self.announce,
+        )
+        """Sets the origin of the autopilot's local frame."""
         self._firmware = _FIRMWARE.get(options.profile, Firmware.OTHER)
-        self._streams.firmware = self._firmware
+        self._streams.firmware = self.origin.firmware = self._firmware
         self._first_reset: int | None = None
         self._mode = VehicleMode()
 
@@ -145,6 +159,7 @@ class AutopilotLink:
             group.create_task(self._heartbeats())
             group.create_task(self._questions())
             group.create_task(self._streams.run())
+            group.create_task(self.origin.run())
 
     @property
     def firmware(self) -> Firmware:
@@ -377,13 +392,18 @@ class AutopilotLink:
             case LocalPosition():
                 self._streams.heard(LOCAL_POSITION_ID)
                 self._take_position(message)
+            case GlobalOrigin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude):
+                self.origin.said(GlobalPlace(latitude, longitude, altitude))
             case Heartbeat():
                 self._mode = mode_of(message)
+                self.origin.is_armed = self._mode.is_armed
                 if self._options.profile == "auto":
                     self._is_of(firmware_of(message.autopilot))
             case CommandAck(command=command, result=result, target_system=target):
-                for_us = target in (0, self._system_id) and command == SET_MESSAGE_INTERVAL
-                if for_us and result != RESULT_ACCEPTED:
+                for_us = target in (0, self._system_id)
+                if for_us and command == SET_GLOBAL_ORIGIN:
+                    self.origin.answered(result)
+                elif for_us and command == SET_MESSAGE_INTERVAL and result != RESULT_ACCEPTED:
                     _log.warning("the autopilot refuses to stream attitude (result %d)", result)
 
     def _take_command(self, message: CommandLong) -> None:
@@ -410,6 +430,7 @@ class AutopilotLink:
             self.on_parameter(message)
 
     def _take_position(self, message: LocalPosition) -> None:
+        self.origin.height_m = -float(message.position[2])
         offset_ns = self._offset_ns(self._clock.now_ns())
         if offset_ns is not None:
             measured_ns = message.time_boot_ms * 1_000_000 + offset_ns
@@ -419,7 +440,7 @@ class AutopilotLink:
         if firmware is not self._firmware:
             self._firmware = firmware
             _log.info("the autopilot's firmware: %s", firmware.value)
-            self._streams.firmware = firmware
+            self._streams.firmware = self.origin.firmware = firmware
             self._streams.ask_for_all()
 
     def _take_attitude(self, sample: AttitudeSample) -> None:
@@ -438,6 +459,7 @@ class AutopilotLink:
                 self._sync.reset()
                 self._fusion = FusionMonitor()
                 self._streams.ask_for_all()
+                self.origin.forget()
                 (self._by_euler if quaternion else self._by_quaternion).clear()
         self._wake()
 
@@ -478,6 +500,15 @@ class AutopilotLink:
         self._transport.write(
             self._codec.set_message_interval(self._system_id, message_id, interval_us)
         )
+
+    def _request(self, message_id: int) -> None:
+        self._transport.write(self._codec.request_message(self._system_id, message_id))
+
+    def _set_origin(
+        self, encode: Callable[[int, float, float, float], bytes], place: GlobalPlace
+    ) -> None:
+        at = (place.latitude_deg, place.longitude_deg, place.altitude_m)
+        self._transport.write(encode(self._system_id, *at))
 
     def _read_parameter(self, name: str) -> None:
         self._transport.write(self._codec.read_parameter(self._system_id, name))

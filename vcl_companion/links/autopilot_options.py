@@ -54,6 +54,9 @@ class AutopilotOptions:
         heading: whose north poses are told in: ``map``, the leader's at the first map, for an
             autopilot that takes its heading from us; ``autopilot``, its own at the first pose,
             for one that flies by its compass.
+        origin: latitude and longitude, degrees, and altitude above mean sea level, m, of the
+            world's origin: the leader's body at the first map; the same on every drone.
+            None: the autopilot is told no place on Earth.
     """
 
     link: str = "serial:/dev/serial0:921600"
@@ -73,6 +76,7 @@ class AutopilotOptions:
     blend_speed_m_s: float = 0.3
     blend_turn_deg_s: float = 5.0
     heading: Heading = "map"
+    origin: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         parse_link(self.link)
@@ -104,3 +108,17 @@ class AutopilotOptions:
             raise ConfigError(f"blend_speed_m_s: must be in 0.01..5, got {self.blend_speed_m_s}")
         if not 0.1 <= self.blend_turn_deg_s <= 90.0:
             raise ConfigError(f"blend_turn_deg_s: must be in 0.1..90, got {self.blend_turn_deg_s}")
+        if self.origin is not None:
+            _check_origin(*self.origin)
+
+
+def _check_origin(latitude_deg: float, longitude_deg: float, altitude_m: float) -> None:
+    if not (abs(latitude_deg) <= 89.0 and abs(longitude_deg) <= 180.0):
+        raise ConfigError(
+            "origin: must be [latitude, longitude, altitude] in -89..89 and -180..180 degrees, got "
+            f"[{latitude_deg:g}, {longitude_deg:g}, {altitude_m:g}]"
+        )
+    if not -500.0 <= altitude_m <= 9000.0:
+        raise ConfigError(f"origin: its altitude must be in -500..9000 m, got {altitude_m:g}")
+    if latitude_deg == longitude_deg == 0.0:
+        raise ConfigError("origin: 0, 0 is what autopilots take for none; leave it out for none")

@@ -34,6 +34,8 @@ from vcl_companion.links.messages import (
     COMPONENT_AUTOPILOT,
     COMPONENT_COMPANION,
     MAX_TUNNEL_BYTES,
+    REQUEST_MESSAGE,
+    SET_GLOBAL_ORIGIN,
     SET_MESSAGE_INTERVAL,
     Message,
     Timesync,
@@ -260,6 +262,38 @@ class Codec:
                 target_system, COMPONENT_AUTOPILOT, SET_MESSAGE_INTERVAL, 0, *parameters
             )
         )
+
+    def request_message(self, target_system: int, message_id: int) -> bytes:
+        """Return the command that asks the autopilot for one message, once."""
+        parameters = (float(message_id), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return self._pack(
+            dialect.MAVLink_command_long_message(
+                target_system, COMPONENT_AUTOPILOT, REQUEST_MESSAGE, 0, *parameters
+            )
+        )
+
+    def command_global_origin(
+        self, target_system: int, latitude_deg: float, longitude_deg: float, altitude_m: float
+    ) -> bytes:
+        """Return the COMMAND_INT that sets the origin of the autopilot's local frame (611)."""
+        return self._pack(
+            dialect.MAVLink_command_int_message(
+                target_system, COMPONENT_AUTOPILOT, dialect.MAV_FRAME_GLOBAL, SET_GLOBAL_ORIGIN,
+                0, 0, 0.0, 0.0, 0.0, 0.0,
+                round(1e7 * latitude_deg), round(1e7 * longitude_deg), altitude_m,
+            )
+        )  # fmt: skip
+
+    def set_global_origin(
+        self, target_system: int, latitude_deg: float, longitude_deg: float, altitude_m: float
+    ) -> bytes:
+        """Return the SET_GPS_GLOBAL_ORIGIN that does the same; it has no answer of its own."""
+        return self._pack(
+            dialect.MAVLink_set_gps_global_origin_message(
+                target_system, round(1e7 * latitude_deg), round(1e7 * longitude_deg),
+                round(1e3 * altitude_m),
+            )
+        )  # fmt: skip
 
     def command(
         self,

@@ -12,9 +12,11 @@ COMPONENT_COMPANION = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 MAX_TUNNEL_BYTES = 128
 STATUS_TEXT_BYTES = 50
 GET_MESSAGE_INTERVAL, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE = 510, 511, 512
+SET_GLOBAL_ORIGIN = 611
 HEARTBEAT_ID = 0
 ATTITUDE_QUATERNION_ID = 31
 LOCAL_POSITION_ID = 32
+GLOBAL_ORIGIN_ID = 49
 VISION_POSITION_ESTIMATE_ID = 102
 AUTOPILOT_VERSION_ID = 148
 EKF_STATUS_REPORT_ID = 193
@@ -160,6 +162,15 @@ class LocalPosition(Message):
     time_boot_ms: int
     position: Array
     velocity: Array
+
+
+@dataclass(frozen=True)
+class GlobalOrigin(Message):
+    """Where on Earth an autopilot's local frame begins: degrees, m above mean sea level."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from vcl_companion.links.messages import (
     CommandAck,
     CommandLong,
     EstimatorStatus,
+    GlobalOrigin,
     Heartbeat,
     LocalPosition,
     Message,
@@ -93,6 +94,13 @@ def _local_position(m: Any, sender: _Sender) -> Message | str:
     return LocalPosition(*sender, m.time_boot_ms, values[:3], values[3:])
 
 
+def _global_origin(m: Any, sender: _Sender) -> Message | str:
+    latitude_deg, longitude_deg = m.latitude * 1e-7, m.longitude * 1e-7
+    if abs(latitude_deg) > 90.0 or abs(longitude_deg) > 180.0:
+        return "global origin is no place"
+    return GlobalOrigin(*sender, latitude_deg, longitude_deg, m.altitude * 1e-3)
+
+
 def _tunnel(m: Any, sender: _Sender) -> Message | str:
     if m.payload_length > MAX_TUNNEL_BYTES:
         return "tunnel length is a lie"
@@ -163,6 +171,7 @@ READERS: dict[str, Callable[[Any, _Sender], Message | str]] = {
     "EKF_STATUS_REPORT": _ekf_status_report,
     "ESTIMATOR_STATUS": _estimator_status,
     "LOCAL_POSITION_NED": _local_position,
+    "GPS_GLOBAL_ORIGIN": _global_origin,
     "PARAM_VALUE": _parameter_value,
     "PARAM_REQUEST_LIST": _parameter_list,
     "PARAM_REQUEST_READ": _parameter_read,
