@@ -139,9 +139,14 @@ def status(config_path: Path, as_json: bool) -> None:
 @click.option("--fix", is_flag=True, help="Set the autopilot's parameters that are wrong.")
 @click.option("--yes", is_flag=True, help="With --fix or --restore: do not ask.")
 @click.option("--restore", is_flag=True, help="Put back what --fix has changed.")
-def check(config_path: Path, as_json: bool, fix: bool, yes: bool, restore: bool) -> None:
+@click.option("--tilt", is_flag=True, help="Check the axes as well: turn the drone by hand.")
+def check(
+    config_path: Path, as_json: bool, fix: bool, yes: bool, restore: bool, tilt: bool
+) -> None:
     """Look before flight at what keeps the service and the autopilot from working together.
 
+    With --tilt, drones are held in the hands and turned to all sides: that shows a camera that
+    sits otherwise than configured, swapped axes, and images that are stamped late.
     What --fix changes is kept beside the configuration, in NAME.parameters.json.
     Exit status: 0 when nothing failed, 1 when something did, 2 when it cannot be looked at.
     """
@@ -159,7 +164,9 @@ def check(config_path: Path, as_json: bool, fix: bool, yes: bool, restore: bool)
     if restore:
         wanted = read_before(kept)
     else:
-        outcome = asyncio.run(check_all(config))
+        asks = sys.stdin.isatty() and not (as_json or yes)
+        tilt = tilt or (asks and click.confirm("Turn the drone by hand, to check its axes?"))
+        outcome = asyncio.run(check_all(config, _ask_for_tilt if tilt else None))
         if as_json:
             click.echo(outcome_json(outcome))
         else:
@@ -183,6 +190,14 @@ def check(config_path: Path, as_json: bool, fix: bool, yes: bool, restore: bool)
         click.echo(f"vcl: {name}: the autopilot did not take it", err=True)
     click.echo("Restart the autopilot: some take effect only then.")
     context.exit(1 if failed else 0)
+
+
+def _ask_for_tilt() -> None:
+    click.echo(
+        "Hold the drone before what stands still, metres away. Slowly: its nose up and down, "
+        "either side down, and turn it, by 30 degrees or more each.",
+        err=True,
+    )
 
 
 @main.group()

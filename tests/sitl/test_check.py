@@ -3,24 +3,32 @@
 import asyncio
 import contextlib
 import json
+import queue
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
 from sitl.autopilots.stand_in import PARAMETERS
+from sitl.frame_server import FrameServer
+from sitl.processes import FlightError
+from tests.daemon import turned_by_hand as by_hand
 from vcl_companion.cli import main
 from vcl_companion.clock import SystemClock
 from vcl_companion.daemon.check_host import judge_frames
 from vcl_companion.daemon.parameter_rules import findings, rules_for
+from vcl_companion.geometry.pose import Pose
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.vision_pose import Firmware
+from vcl_companion.recording.sensor import Sensor, write_sensor
 
 ROOT = Path(__file__).parents[2]
 DRONE = ROOT / "sitl" / "recordings" / "demo" / "mav0"
@@ -34,12 +42,25 @@ PX4 = {
 }  # fmt: skip
 
 
+def at_rest(_: float) -> Pose:
+    return Pose(np.eye(3), np.array([0.0, 0.0, -5.0]))
+
+
 @contextlib.contextmanager
-def autopilot(folder: Path, parameters: Mapping[str, float]) -> Iterator[int]:
-    """A stand-in whose time goes on by itself; yields its port."""
+def autopilot(
+    folder: Path,
+    parameters: Mapping[str, float],
+    pose_at: Callable[[float], Pose] = at_rest,
+    began_s: float | None = None,
+) -> Iterator[int]:
+    """A stand-in that is where ``pose_at`` says so long after it began; yields its port."""
     folder.mkdir(exist_ok=True)
     start_ns = 1_760_000_000_000_000_000
-    rows = [f"{start_ns + k * 10**9},0,0,-5,1,0,0,0" for k in range(60)]
+    rows = []
+    for k in range(20 * 60):
+        pose = pose_at(k / 20)
+        values = [*pose.translation.tolist(), *pose.quaternion().tolist()]
+        rows.append(f"{start_ns + k * 50_000_000},{','.join(map(repr, values))}")
     truth = folder / "truth.csv"
     truth.write_text("\n".join(["at_ns,x,y,z,qw,qx,qy,qz", *rows]) + "\n")
     config = folder / "stand_in.json"
@@ -63,9 +84,9 @@ def autopilot(folder: Path, parameters: Mapping[str, float]) -> Iterator[int]:
     def go_on() -> None:
         assert process.stdin is not None
         assert process.stdout is not None
-        began_s = time.monotonic()
+        since_s = time.monotonic() if began_s is None else began_s
         while not over.wait(0.01):
-            now_ns = start_ns + round((time.monotonic() - began_s) * 1e9)
+            now_ns = start_ns + round((time.monotonic() - since_s) * 1e9)
             process.stdin.write(json.dumps({"advance_to_ns": now_ns}) + "\n")
             process.stdin.flush()
             process.stdout.readline()
@@ -85,20 +106,114 @@ def autopilot(folder: Path, parameters: Mapping[str, float]) -> Iterator[int]:
         process.communicate()
 
 
-def config_of(tmp_path: Path, port: int) -> Path:
+def config_of(tmp_path: Path, port: int, autopilot: str = "", camera: str = "") -> Path:
     path = tmp_path / "one.toml"
+    camera = (
+        camera
+        or f"""source = "recording:{DRONE}"
+calibration = "{DRONE / "cam0" / "sensor.yaml"}"
+"""
+    )
     path.write_text(
         f"""system_id = {SYSTEM}
 [camera]
-source = "recording:{DRONE}"
-calibration = "{DRONE / "cam0" / "sensor.yaml"}"
+{camera}
 [autopilot]
 link = "udp:127.0.0.1:{port}"
+{autopilot}
 [map]
 directory = "{tmp_path / "maps"}"
 """
     )
     return path
+
+
+@contextlib.contextmanager
+def camera(began_s: float, rate_hz: float = by_hand.RATE_HZ) -> Iterator[int]:
+    """A camera that shows the drone that is turned by hand since an instant; yields its port."""
+    ported: queue.Queue[int] = queue.Queue()
+    encoded = [bytes(cv2.imencode(".png", image)[1]) for image in by_hand.images()]
+    over = threading.Event()
+
+    async def serve() -> None:
+        server = FrameServer("mav0")
+        ported.put(await server.start())
+        k = 0
+        while not over.is_set():
+            k += 1
+            at_s = began_s + k / rate_hz
+            if at_s < time.monotonic() - 0.5 / rate_hz:
+                continue
+            await asyncio.sleep(max(at_s - time.monotonic(), 0.0))
+            if server.is_connected:
+                shown = round(by_hand.folded(k / rate_hz) * by_hand.RATE_HZ)
+                image = encoded[min(shown, len(encoded) - 1)]
+                try:
+                    server.give(k, round(at_s * 1e9), image)
+                except FlightError:
+                    await server.was_killed()  # who looked has hung up: another may look
+        await server.close()
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()))
+    thread.start()
+    try:
+        yield ported.get()
+    finally:
+        over.set()
+        thread.join()
+
+
+@contextlib.contextmanager
+def held(tmp_path: Path, mounting_deg: str, rate_hz: float = by_hand.RATE_HZ) -> Iterator[Path]:
+    """A drone that is turned by hand; yields its configuration, with a mounting."""
+    by_hand.images()
+    began_s = time.monotonic()
+    sensor = tmp_path / "camera.yaml"
+    write_sensor(sensor, Sensor(by_hand.LENS, by_hand.BODY_FROM_CAM, by_hand.RATE_HZ))
+
+    def pose_at(at_s: float) -> Pose:
+        return by_hand.world_from_body(by_hand.folded(at_s))
+
+    with (
+        camera(began_s, rate_hz) as camera_port,
+        autopilot(tmp_path / "a", {}, pose_at, began_s) as port,
+    ):
+        lines = f"""source = "stream:127.0.0.1:{camera_port}"
+calibration = "{sensor}"
+mounting_deg = {mounting_deg}
+"""
+        yield config_of(tmp_path, port, camera=lines)
+
+
+def line_of(result: Result, name: str) -> str:
+    """What is said of one thing."""
+    (line,) = [text for text in result.output.splitlines() if text.split()[1:2] == [name]]
+    return line
+
+
+def test_a_drone_turned_by_hand_shows_that_its_camera_sits_right(tmp_path: Path) -> None:
+    with held(tmp_path, "[0, -10, 0]") as config:
+        result = check(config, "--tilt")
+    assert result.exit_code == 0, result.output
+    assert "Hold the drone" in result.output
+    assert line_of(result, "axes").startswith("ok ")
+    assert line_of(result, "latency").startswith("ok ")
+
+
+def test_a_drone_turned_by_hand_shows_that_its_camera_sits_wrong(tmp_path: Path) -> None:
+    with held(tmp_path, "[90, 0, 0]") as config:
+        result = check(config, "--tilt")
+    assert result.exit_code == 1
+    line = line_of(result, "axes")
+    assert line.startswith("failure ")
+    assert "camera.mounting_deg = [0, -10, 0]" in line
+
+
+def test_a_camera_of_one_hertz_is_a_failure(tmp_path: Path) -> None:
+    with held(tmp_path, "[0, -10, 0]", rate_hz=1.0) as config:
+        result = check(config)
+    assert result.exit_code == 1
+    assert line_of(result, "camera").startswith("failure ")
 
 
 def check(config: Path, *options: str, answer: str = "") -> Result:

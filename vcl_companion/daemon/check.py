@@ -8,13 +8,18 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass
 
+from vcl_companion.cameras.mounting import read_calibration
+from vcl_companion.cameras.open import open_camera
 from vcl_companion.clock import Clock, SystemClock
 from vcl_companion.config import Config
+from vcl_companion.daemon.check_axes import judge_axes
 from vcl_companion.daemon.check_host import Check, Grade, of_camera, of_files, of_wall_clock
+from vcl_companion.daemon.check_motion import watch_motion
+from vcl_companion.daemon.frame_rules import of_frames
 from vcl_companion.daemon.parameter_rules import Finding, findings, names_of, rules_for
 from vcl_companion.errors import VclError
 from vcl_companion.links.autopilot import AutopilotLink
@@ -24,6 +29,8 @@ _HEARTBEAT_S = 5.0
 _STREAM_S = 2.5
 _LEAST_ATTITUDE_SHARE = 0.5
 _ROUND_TRIP_S = 0.05
+# How long somebody may take to turn the drone to all sides.
+TILT_S = 40.0
 _GRADE_OF: dict[str, Grade] = {
     "dangerous": "failure",
     "prevents": "failure",
@@ -44,13 +51,21 @@ class Outcome:
         return all(check.grade != "failure" for check in self.checks)
 
 
-async def check_all(config: Config) -> Outcome:
-    """Look at everything; what cannot be looked at is a failure of its own."""
+async def check_all(config: Config, tilt: Callable[[], None] | None = None) -> Outcome:
+    """Look at everything; what cannot be looked at is a failure of its own.
+
+    Args:
+        config: of the daemon.
+        tilt: asks somebody to turn the drone by hand, from when it is watched; None: nobody
+            is asked, and the axes are not looked at.
+    """
     clock = SystemClock()
     checks = [*of_files(config), of_wall_clock()]
     checks.append(await of_camera(config, clock))
     async with _linked(config, clock) as link:
-        more, wrong = await _of_autopilot(config, link)
+        more, wrong = await of_autopilot(config, link)
+        if tilt is not None and link.firmware is not Firmware.OTHER:
+            more += await _of_axes(config, link, clock, tilt)
     return Outcome((*checks, *more), tuple(wrong))
 
 
@@ -109,7 +124,25 @@ async def _heard_of(link: AutopilotLink) -> bool:
     return link.firmware is not Firmware.OTHER
 
 
-async def _of_autopilot(config: Config, link: AutopilotLink) -> tuple[list[Check], list[Finding]]:
+async def _of_axes(
+    config: Config, link: AutopilotLink, clock: Clock, tilt: Callable[[], None]
+) -> list[Check]:
+    """Have the drone turned by hand, and judge what is seen and said of that."""
+    try:
+        sensor = read_calibration(config.camera)
+        camera = open_camera(config.camera, sensor, clock)
+        try:
+            tilt()
+            motion = await watch_motion(camera, sensor.camera, link, clock, TILT_S)
+        finally:
+            await camera.close()
+    except (VclError, OSError) as error:
+        return [Check("axes", "failure", str(error), "is the camera free?")]
+    return judge_axes(motion, sensor.body_from_cam.rotation)
+
+
+async def of_autopilot(config: Config, link: AutopilotLink) -> tuple[list[Check], list[Finding]]:
+    """Look at what the autopilot behind a running link says of itself."""
     if not await _heard_of(link):
         advice = f"is it on, and autopilot.link right ({config.autopilot.link})? its system_id?"
         what = f"no heartbeat of system {config.system_id} in {_HEARTBEAT_S:.0f} s"
@@ -140,6 +173,7 @@ async def _of_autopilot(config: Config, link: AutopilotLink) -> tuple[list[Check
                 f"set it to {found.should_be:g}",
             )
         )
+    checks += of_frames(config.autopilot, link.firmware, values)
     if not wrong:
         checks.append(Check("parameters", "ok", f"all {len(values)} that matter are right"))
     return checks, wrong
