@@ -40,12 +40,15 @@ SIGMA_M = 0.02
 BEGINS_AT = np.array([2.0, 2.7, -1.5])
 
 
-def motion() -> RecordedMotion:
-    """A minute and a half of wide turns at up to 1.6 m/s, away from the origin."""
+def motion(rests_s: float = 0.0) -> RecordedMotion:
+    """A minute and a half of wide turns at up to 1.6 m/s, away from the origin, after a rest."""
     t = np.arange(0.0, 90.0, 0.1)
+    at = START_NS + np.round(t * 1e9).astype(np.int64)
+    since = np.maximum(t - rests_s, 0.0)
+    t = since**2 / (since + 2.0) if rests_s else t
     positions = BEGINS_AT + np.c_[4.0 * np.sin(0.4 * t), 2.0 * np.cos(0.4 * t) - 2.0, -0.1 * t]
     level = np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))
-    return RecordedMotion(START_NS + np.round(t * 1e9).astype(np.int64), positions, level)
+    return RecordedMotion(at, positions, level)
 
 
 class Flight:
@@ -111,8 +114,9 @@ def flown(
     tmp_path: Path,
     scenario: Callable[[Flight, Path], Coroutine[None, None, None]],
     origin: tuple[float, float, float] | None = None,
+    rests_s: float = 0.0,
 ) -> None:
-    true = motion()
+    true = motion(rests_s)
     out = tmp_path / "mav1"
     options = FirmwareOptions(
         Path(_BINARY), SYSTEM, START_NS - BOOTED_BEFORE_NS, true, RECORDED, 0.0, out,
@@ -196,11 +200,11 @@ def test_told_its_origin_before_poses_it_knows_its_global_position_by_them(tmp_p
         flight.origin_world = np.array([30.0, -20.0, -2.0])
         assert places.read_text() == ""
         while "VCL origin set" not in heard.read_text():
-            assert flight.clock.now_ns() < START_NS + 15_000_000_000
+            assert flight.clock.now_ns() < START_NS + 20_000_000_000
             await flight.fly(1.0, sends=False)
         await flight.fly(2.0)
         assert flight.link.fusion().state is FusionState.FUSED
-        await flight.fly(10.0)
+        await flight.fly(25.0)
         assert flight.states == [FusionState.FUSED]
         assert flight.apart_m(fused).max() < 0.1
         at_ns, latitude, longitude, altitude = map(
@@ -215,7 +219,7 @@ def test_told_its_origin_before_poses_it_knows_its_global_position_by_them(tmp_p
         ]
         assert np.abs(off_m).max() < 0.3, off_m
 
-    flown(tmp_path, scenario, origin)
+    flown(tmp_path, scenario, origin, rests_s=20.0)
 
 
 def test_an_origin_that_would_throw_its_height_waits(tmp_path: Path) -> None:
