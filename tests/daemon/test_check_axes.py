@@ -229,3 +229,9 @@ def test_without_an_attitude_nothing_is_judged() -> None:
     check = axes(judge_axes(Motion(motion.seen), mounted_rotation(RIGHT)))
     assert check.grade == "warning"
     assert axes(judge_axes(Motion(), mounted_rotation(RIGHT))).grade == "warning"
+
+
+def test_a_camera_that_sees_nothing_is_told_so() -> None:
+    check = axes(judge_axes(Motion(n_unseen=40), mounted_rotation(RIGHT)))
+    assert check.grade == "warning"
+    assert "sees too little" in check.advice

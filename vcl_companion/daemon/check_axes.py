@@ -34,6 +34,8 @@ _SHIFTS_S = np.linspace(-0.3, 0.3, 31)
 _ALIKE, _FLAT, _FLAT_SIZES, _ASIDE = 0.8, 0.005, 0.03, 5
 _ADVICE = "hold it in the hands, and tilt it to all sides by 30 degrees or more: vcl check --tilt"
 
+_ADVICE_DARK = "the camera sees too little to follow: light, sharpness, something with corners"
+
 
 def judge_axes(motion: Motion, body_from_cam: Array) -> list[Check]:
     """Judge a motion.
@@ -45,7 +47,10 @@ def judge_axes(motion: Motion, body_from_cam: Array) -> list[Check]:
     late_s = latency_s(motion)
     windows = _windows(motion, late_s or 0.0, _LEAST_WINDOW_DEG)
     if len(windows.seen) < _LEAST_WINDOWS:
-        what = f"not judged: it turned in {len(windows.seen)} looks, of {len(motion.seen)}"
+        n_pairs = len(motion.seen) + motion.n_unseen
+        what = f"not judged: of {n_pairs} looks {len(windows.seen)} tell of a turn, seen and said"
+        if motion.n_unseen > len(motion.seen):
+            return [Check("axes", "warning", what, _ADVICE_DARK)]
         return [Check("axes", "warning", what, _ADVICE)]
     fit = fit_axes(windows.seen, windows.said)
     checks = [_of_windows(windows, fit, body_from_cam, is_timed=late_s is not None)]
