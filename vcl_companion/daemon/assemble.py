@@ -111,7 +111,6 @@ async def _run(config: Config) -> int:
         signal.signal(number, end)
     clock: Clock = ManualClock() if config.clock == "camera" else SystemClock()
     sensor = read_calibration(config.camera)
-    _log.info("the camera's %s", mounting_text(sensor.body_from_cam.rotation))
     log = FlightLog(config.log.flight_log, clock)
     maps = MapStore(config.map.directory)
     signing = open_signing(config.peers)
@@ -134,6 +133,7 @@ async def _run(config: Config) -> int:
     autopilot.origin.origin_world = lambda: origin_in_leaders_world(
         estimator.local, group, maps.current
     )
+    _log.info("the camera's %s", mounting_text(sensor.body_from_cam.rotation))
     vision = Worker("vision")
     # Before anybody is told that we are here: no frame has to wait for the compiler.
     notify.status("compiling, once on this machine")
