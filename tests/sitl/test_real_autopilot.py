@@ -21,11 +21,13 @@ from sitl.autopilots.flown import Flown
 from sitl.autopilots.motion import RecordedMotion
 from sitl.autopilots.steered import open_udp
 from vcl_companion.clock import ManualClock
+from vcl_companion.daemon.resets import Resets
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.fusion import FusionState
+from vcl_companion.links.vehicle_mode import VehicleMode
 from vcl_companion.links.vision_pose import PoseEstimate
 
 _BINARY = os.environ.get("VCL_ARDUPILOT", "")
@@ -37,6 +39,7 @@ BOOTED_BEFORE_NS = 40_000_000_000
 STEP_NS = 20_000_000
 PERIOD_NS = 100_000_000
 SIGMA_M = 0.02
+IN_GUIDED = VehicleMode(is_armed=True, follows_positions=True)
 BEGINS_AT = np.array([2.0, 2.7, -1.5])
 
 
@@ -68,6 +71,8 @@ class Flight:
         self.link.origin.origin_world = lambda: self.origin_world
         self.off = np.zeros(3)
         self.n_resets = 0
+        self.slide: Resets | None = None
+        self.slid = np.zeros(3)
         self.states: list[FusionState] = []
         self._autopilot = autopilot
         self._true = true
@@ -91,6 +96,13 @@ class Flight:
         there = self._true.at(np.array([now_ns], dtype=np.int64))
         told = Pose(np.eye(3), there.positions_m[0] + self.off)
         covariance = np.diag([SIGMA_M**2] * 3 + [1e-4] * 3)
+        if self.slide is not None:
+            expected = Pose(np.eye(3), there.positions_m[0])
+            assert not self.slide.decide(
+                told, covariance, now_ns, 1, expected, IN_GUIDED, was_silent=False
+            )
+            told, _ = self.slide.told(told, now_ns)
+            self.slid = told.translation - there.positions_m[0]
         estimate = PoseEstimate(
             told, covariance, there.velocities_m_s[0], 0.01 * np.eye(3), now_ns, self.n_resets
         )
@@ -99,6 +111,12 @@ class Flight:
     def true_at(self, at_ns: int) -> Array:
         """Return (3,) where it was."""
         return np.asarray(self._true.at(np.array([at_ns], dtype=np.int64)).positions_m[0])
+
+    def off_m(self, fused: Path) -> Array:
+        """Return (3,) how far from the truth it last said to be."""
+        at_ns, *values = fused.read_text().splitlines()[-1].split(",")
+        true = self.true_at(int(at_ns))
+        return np.asarray(np.array([float(value) for value in values]) - true)
 
     def apart_m(self, fused: Path) -> Array:
         """Return (T,) how far it was from where it was told to be, in the last second."""
@@ -162,6 +180,24 @@ def test_a_jump_that_is_told_is_followed_within_a_third_of_a_second(tmp_path: Pa
         await flight.fly(3.0)
         assert flight.states == [FusionState.FUSED]
         assert flight.apart_m(fused).max() < 0.15
+
+    flown(tmp_path, scenario)
+
+
+def test_a_slide_is_followed_without_a_reset(tmp_path: Path) -> None:
+    async def scenario(flight: Flight, fused: Path) -> None:
+        await flight.fly(10.0)
+        told: list[str] = []
+        flight.slide = Resets("blend", 0.3, 0.1, lambda what, _: told.append(what))
+        flight.slide.decide(Pose.identity(), np.eye(6), 0, 0, None, IN_GUIDED, was_silent=False)
+        flight.off = np.array([1.8, -2.4, 0.0])
+        while len(told) < 2:
+            await flight.fly(1.0)
+            assert flight.states == [FusionState.FUSED]
+            assert np.linalg.norm(flight.off_m(fused) - flight.slid) < 0.15
+        assert flight.n_resets == flight.slide.n_resets == 0
+        await flight.fly(3.0)
+        assert flight.apart_m(fused).max() < 0.1
 
     flown(tmp_path, scenario)
 
