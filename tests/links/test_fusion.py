@@ -8,6 +8,7 @@ import pytest
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.fusion import FusionMonitor, FusionState
 from vcl_companion.links.messages import EstimatorStatus
+from vcl_companion.links.vision_pose import Firmware
 
 MS = 1_000_000
 S = 1_000 * MS
@@ -32,8 +33,11 @@ class Flight:
         self.now_ns = S
         self.sends = self.tells = self.reports = True
         self.off = np.zeros(3)
+        self.told_off, self.n_resets = np.zeros(3), 0
+        self.sinks_m_s = 0.0
         self.ahead_s = 0.0
-        self.has_position, self.holds_position, self.ratio = True, False, 0.1
+        self.has_position, self.holds_position = True, False
+        self.ratio: float | None = 0.1
 
     def fly(self, seconds: float) -> list[FusionState]:
         """Go on for so long; return the states that it was told, each once."""
@@ -41,16 +45,17 @@ class Flight:
         for _ in range(round(seconds * 10)):
             self.now_ns += 100 * MS
             if self.sends:
-                self.monitor.sent(
-                    self.now_ns - 40 * MS, position_at(self.now_ns - 40 * MS), SIGMA_M
-                )
+                of_ns = self.now_ns - 40 * MS
+                told = position_at(of_ns) + self.told_off
+                self.monitor.sent(of_ns, told, SIGMA_M, self.n_resets)
             if self.reports:
                 status = EstimatorStatus(1, 1, self.has_position, self.holds_position, self.ratio)
                 self.monitor.reported(status, self.now_ns)
             if self.tells:
-                of_ns = self.now_ns + self.ahead_s * 1e9
-                there = position_at(of_ns) + self.off
-                self.monitor.believes(self.now_ns, there, velocity_at(of_ns))
+                seen_ns = self.now_ns + self.ahead_s * 1e9
+                self.off = self.off + np.array([0.0, 0.0, 0.1 * self.sinks_m_s])
+                there = position_at(seen_ns) + self.off
+                self.monitor.believes(self.now_ns, there, velocity_at(seen_ns))
             state = self.monitor.state(self.now_ns).state
             if not states or states[-1] is not state:
                 states.append(state)
@@ -132,6 +137,47 @@ def test_who_does_not_follow_us_has_not_fused_us(
     assert flight.fly(0.8) == [FusionState.FUSED]
     assert flight.fly(4.0)[-1] is FusionState.REJECTED
     assert reason in flight.reason
+
+
+def test_a_height_that_counts_from_elsewhere_is_not_wrong_unless_it_goes_elsewhere() -> None:
+    flight = Flight()
+    flight.off = np.array([0.0, 0.0, -12.0])
+    flight.sinks_m_s = 0.1
+    assert flight.fly(12.0)[-1] is FusionState.FUSED
+    assert flight.fly(30.0) == [FusionState.FUSED]
+    flight.sinks_m_s = 2.0
+    assert flight.fly(4.0)[-1] is FusionState.REJECTED
+
+
+def test_a_jump_of_ours_in_height_that_a_barometer_does_not_follow_is_no_refusal() -> None:
+    flight = Flight()
+    flight.fly(12.0)
+    flight.told_off, flight.n_resets = np.array([0.0, 0.0, 5.0]), 1
+    assert flight.fly(10.0) == [FusionState.FUSED]
+
+
+def test_who_tests_no_position_says_nothing_of_it() -> None:
+    flight = Flight()
+    flight.ratio = None
+    assert flight.fly(10.0)[-1] is FusionState.FUSED
+
+
+@pytest.mark.parametrize(
+    ("firmware", "every_ms", "is_told"),
+    [(Firmware.PX4, 200, True), (Firmware.PX4, 150, False), (Firmware.ARDUPILOT, 200, False)],
+)
+def test_poses_too_seldom_for_px4_to_begin_are_told(
+    firmware: Firmware, every_ms: int, is_told: bool
+) -> None:
+    monitor = FusionMonitor()
+    monitor.firmware = firmware
+    for k in range(60):
+        at_ns = S + k * every_ms * MS
+        monitor.sent(at_ns, position_at(at_ns), SIGMA_M)
+        monitor.reported(EstimatorStatus(1, 1, False, False, None), at_ns)
+        reason = monitor.state(at_ns).reason
+    assert "has no position" in reason
+    assert ("ours come 5.0 times a second" in reason) is is_told
 
 
 def test_an_estimator_that_never_takes_us_is_told_of_after_a_while() -> None:

@@ -15,6 +15,7 @@ from vcl_companion.links.messages import (
     AttitudeSample,
     CommandAck,
     CommandLong,
+    EstimatorStatus,
     Heartbeat,
     Message,
     StatusText,
@@ -49,6 +50,38 @@ def test_frames_made_by_hand_are_understood() -> None:
     assert decoded(command) == expected
     ack = wire.packed(wire.COMMAND_ACK, 511, 4, 0, 0, 9, 197)
     assert decoded(ack) == CommandAck(1, 1, 511, 4, 9, 197, 0)
+
+
+def estimator_status(flags: int, ratio: float) -> bytes:
+    """As PX4 1.16.1 sends it; ratios that it does not test are no numbers."""
+    nan = math.nan
+    return wire.packed(
+        wire.ESTIMATOR_STATUS, 60_000_000, nan, ratio, 0.01, nan, nan, nan, 0.1, 0.1, flags
+    )
+
+
+@pytest.mark.parametrize(
+    ("flags", "ratio", "expected"),
+    [
+        (0xA5, math.nan, EstimatorStatus(1, 1, False, True, None)),  # on the ground, without us
+        (0x25, math.nan, EstimatorStatus(1, 1, False, False, None)),  # moved, without us
+        (0x1AF, 0.25, EstimatorStatus(1, 1, True, False, 0.25)),  # on the ground, with us
+        (0x12F, 0.25, EstimatorStatus(1, 1, True, False, 0.25)),  # in flight, with us
+    ],
+)
+def test_px4_s_estimator_is_read_as_it_means_it(
+    flags: int, ratio: float, expected: EstimatorStatus
+) -> None:
+    assert decoded(estimator_status(flags, ratio)) == expected
+
+
+def test_ardupilot_s_estimator_is_read_or_refused() -> None:
+    held = wire.packed(wire.EKF_STATUS_REPORT, 0.0, 0.5, 0.0, 0.0, 0.0, 0xA7)
+    assert decoded(held) == EstimatorStatus(1, 1, False, True, 0.5)
+    used = wire.packed(wire.EKF_STATUS_REPORT, 0.0, 0.5, 0.0, 0.0, 0.0, 0x33F)
+    assert decoded(used) == EstimatorStatus(1, 1, True, False, 0.5)
+    broken = wire.packed(wire.EKF_STATUS_REPORT, 0.0, math.nan, 0.0, 0.0, 0.0, 0x33F)
+    assert refusals(broken) == {"estimator's test ratio is no number": 1}
 
 
 def test_attitudes_become_rotations() -> None:

@@ -10,6 +10,7 @@ LOCAL_POSITION_NED, SET_GPS_GLOBAL_ORIGIN, GPS_GLOBAL_ORIGIN, COMMAND_INT = 32, 
 PARAM_REQUEST_READ, PARAM_REQUEST_LIST, PARAM_VALUE, PARAM_SET = 20, 21, 22, 23
 AUTOPILOT_VERSION, MESSAGE_INTERVAL, ONBOARD_COMPUTER_STATUS = 148, 244, 390
 VISION_POSITION_ESTIMATE, TIMESYNC, STATUSTEXT, ODOMETRY, TUNNEL = 102, 111, 253, 331, 385
+EKF_STATUS_REPORT, ESTIMATOR_STATUS = 193, 230
 CRC_EXTRA = {
     HEARTBEAT: 50,
     ATTITUDE: 39,
@@ -26,6 +27,8 @@ CRC_EXTRA = {
     COMMAND_ACK: 143,
     VISION_POSITION_ESTIMATE: 158,
     TIMESYNC: 34,
+    EKF_STATUS_REPORT: 71,
+    ESTIMATOR_STATUS: 163,
     STATUSTEXT: 83,
     ODOMETRY: 91,
     TUNNEL: 147,
@@ -51,6 +54,10 @@ LAYOUT = {
     COMMAND_ACK: struct.Struct("<HBBiBB"),
     VISION_POSITION_ESTIMATE: struct.Struct("<Q6f21fB"),
     TIMESYNC: struct.Struct("<qq"),
+    # velocity, horizontal position, vertical, compass, terrain; flags
+    EKF_STATUS_REPORT: struct.Struct("<5fH"),
+    # time_usec; ratios: velocity, horizontal position, vertical, ...; two accuracies; flags
+    ESTIMATOR_STATUS: struct.Struct("<Q8fH"),
     STATUSTEXT: struct.Struct("<B50sHB"),
     # usec xyz q v rates 21 of the pose 21 of the twist frame child reset estimator quality
     ODOMETRY: struct.Struct("<Q3f4f3f3f21f21fBBBBb"),

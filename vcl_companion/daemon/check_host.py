@@ -129,5 +129,7 @@ def judge_frames(times_ns: list[int], means: list[float]) -> Check:
     if not 25.0 < mean < 230.0:
         return Check("camera", "warning", what, "set the exposure: too dark or too bright")
     if rate_hz < _GOOD_RATE_HZ:
-        return Check("camera", "warning", what, "10 Hz or more are better")
+        return Check(
+            "camera", "warning", what, "10 Hz or more are better: PX4 does not begin with 5"
+        )
     return Check("camera", "ok", what)

@@ -114,7 +114,8 @@ class AutopilotLink:
         )
         """Sets the origin of the autopilot's local frame."""
         self._firmware = _FIRMWARE.get(options.profile, Firmware.OTHER)
-        self._streams.firmware = self.origin.firmware = self._firmware
+        for told in (self._streams, self._fusion, self.origin):
+            told.firmware = self._firmware
         self._first_reset: int | None = None
         self._mode = VehicleMode()
 
@@ -315,7 +316,7 @@ class AutopilotLink:
             self._fusion.sent_between(estimate.at_ns)
             return None
         sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0))
-        self._fusion.sent(estimate.at_ns, pose.translation, sigma_m)
+        self._fusion.sent(estimate.at_ns, pose.translation, sigma_m, estimate.n_resets)
         return None
 
     def _reset_counter(self, n_resets: int) -> int:
@@ -440,7 +441,8 @@ class AutopilotLink:
         if firmware is not self._firmware:
             self._firmware = firmware
             _log.info("the autopilot's firmware: %s", firmware.value)
-            self._streams.firmware = self.origin.firmware = firmware
+            for told in (self._streams, self._fusion, self.origin):
+                told.firmware = firmware
             self._streams.ask_for_all()
 
     def _take_attitude(self, sample: AttitudeSample) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.messages import EstimatorStatus
+from vcl_companion.links.vision_pose import Firmware
 
 # Poses older than this say nothing of where it should be now.
 _MEMORY_NS = 3_000_000_000
@@ -33,9 +34,11 @@ _APART_M, _SIGMAS, _DELAY_S = 0.5, 5.0, 0.25
 _MAX_KEPT = 256
 # How far from its last report of its position it is taken to fly on as it did.
 _EXPECTED_NS = 500_000_000
-# What squares of the speed have to add up to before the delay is told: 20 s at 1 m/s and 5 Hz.
+# What squares of level speed have to add up to before the delay is told: 20 s at 1 m/s and 5 Hz.
 _TELLS_OF_DELAY_M2_S2 = 100.0
 _FORGETS = 0.999
+# PX4's EV_MAX_INTERVAL (EKF/common.h): poses further apart do not make it begin.
+_PX4_BEGINS_WITHIN_S = 0.2
 
 
 class FusionState(enum.Enum):
@@ -66,6 +69,7 @@ class _Sent:
     at_ns: int
     position: Array
     sigma_m: float
+    n_resets: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,12 +83,14 @@ class FusionMonitor:
     """Compares what the autopilot says of itself with what it was sent."""
 
     def __init__(self) -> None:
+        self.firmware = Firmware.OTHER
         self._sent: deque[_Sent] = deque(maxlen=_MAX_KEPT)
         self._believed: deque[_Believed] = deque(maxlen=_MAX_KEPT)
         self._status: EstimatorStatus | None = None
         self._status_at_ns = 0
         self._first_sent_ns: int | None = None
-        self._last_sent_ns = 0
+        # Of frames and between them.
+        self._instants: deque[int] = deque(maxlen=_MAX_KEPT)
         self._told = Fusion(FusionState.WAITING)
         self._other_since_ns: int | None = None
         self._ahead_m2_s = self._flown_m2_s2 = 0.0
@@ -92,7 +98,7 @@ class FusionMonitor:
 
     @property
     def ahead_s(self) -> float | None:
-        """By how much its position is that of a later instant, s; None before enough was flown.
+        """By how much its level position is of a later instant, s; None before enough was flown.
 
         It takes our poses for so much older than they are: what its parameter of their delay
         (``VISO_DELAY_MS``, ``EKF2_EV_DELAY``) is too large by.
@@ -101,16 +107,23 @@ class FusionMonitor:
             return None
         return self._ahead_m2_s / self._flown_m2_s2
 
-    def sent(self, at_ns: int, position: Array, sigma_m: float) -> None:
-        """Note a pose that the autopilot was sent, its instant and its largest sigma."""
+    def sent(self, at_ns: int, position: Array, sigma_m: float, n_resets: int = 0) -> None:
+        """Note a pose that the autopilot was sent, its instant and its largest sigma.
+
+        Args:
+            at_ns: our clock.
+            position: (3,) local NED, m.
+            sigma_m: of its worst direction.
+            n_resets: jumps of our frame so far.
+        """
         if self._first_sent_ns is None:
             self._first_sent_ns = at_ns
-        self._last_sent_ns = max(self._last_sent_ns, at_ns)
-        self._sent.append(_Sent(at_ns, position, sigma_m))
+        self._instants.append(at_ns)
+        self._sent.append(_Sent(at_ns, position, sigma_m, n_resets))
 
     def sent_between(self, at_ns: int) -> None:
         """Note that it was sent a pose that no frame gave: we are not silent, and no more."""
-        self._last_sent_ns = max(self._last_sent_ns, at_ns)
+        self._instants.append(at_ns)
 
     def reported(self, status: EstimatorStatus, at_ns: int) -> None:
         """Note what its estimator says of itself."""
@@ -151,8 +164,7 @@ class FusionMonitor:
     def _seen(self, now_ns: int) -> Fusion:
         if self._first_sent_ns is None:
             return Fusion(FusionState.WAITING)
-        silent_ns = now_ns - self._last_sent_ns
-        if silent_ns > _SILENT_NS:
+        if now_ns - max(self._instants) > _SILENT_NS:
             return Fusion(FusionState.LOST, "nothing was sent for a second or more")
         status = self._status
         if status is None or now_ns - self._status_at_ns > _UNTOLD_NS:
@@ -161,28 +173,43 @@ class FusionMonitor:
             what = "holds its position for constant" if status.holds_position else "has no position"
             begins = now_ns - self._first_sent_ns < _BEGINS_NS
             state = FusionState.SENDING if begins else FusionState.REJECTED
-            return Fusion(state, f"its estimator {what}")
-        if status.position_test_ratio > 1.0:
+            return Fusion(state, f"its estimator {what}{self._too_seldom()}")
+        if status.position_test_ratio is not None and status.position_test_ratio > 1.0:
             return Fusion(FusionState.REJECTED, "our position fails the test of its estimator")
         return self._followed(now_ns)
 
+    def _too_seldom(self) -> str:
+        """Say so where our poses are too far apart for it to begin; else nothing."""
+        if self.firmware is not Firmware.PX4 or len(self._instants) < 2:
+            return ""
+        apart_s = float(np.median(np.diff(sorted(self._instants)))) * 1e-9
+        if apart_s < _PX4_BEGINS_WITHIN_S:
+            return ""
+        return f": ours come {1.0 / apart_s:.1f} times a second, it begins with more than 5"
+
     def _followed(self, now_ns: int) -> Fusion:
         """Say whether its position follows ours."""
-        apart = []
+        off, allowed, n_resets = [], [], []
         for sent in self._sent:
             if now_ns - sent.at_ns > _MEMORY_NS:
                 continue
             there = self._believed_at(sent.at_ns)
             if there is not None:
                 speed_m_s = float(np.linalg.norm(there.velocity))
-                allowed_m = _APART_M + _SIGMAS * sent.sigma_m + _DELAY_S * speed_m_s
-                distance_m = float(np.linalg.norm(there.position - sent.position))
-                apart.append((distance_m, distance_m / allowed_m))
-        if not apart:
+                off.append(there.position - sent.position)
+                allowed.append(_APART_M + _SIGMAS * sent.sigma_m + _DELAY_S * speed_m_s)
+                n_resets.append(sent.n_resets)
+        if not off:
             return Fusion(FusionState.SENDING, "it does not say where it is")
-        newest = apart[-max(1, len(apart) // 3) :]
-        distance_m, share = np.median(np.array(newest), axis=0).tolist()
-        if share > 1.0:
+        off_m = np.array(off)
+        # A barometer's height counts from elsewhere: it has to go as ours goes, between our jumps.
+        for one in set(n_resets):
+            alike = np.array(n_resets) == one
+            off_m[alike, 2] -= np.median(off_m[alike, 2])
+        newest = -max(1, len(off) // 3)
+        distances_m = np.linalg.norm(off_m[newest:], axis=1)
+        if float(np.median(distances_m / np.array(allowed[newest:]))) > 1.0:
+            distance_m = float(np.median(distances_m))
             return Fusion(FusionState.REJECTED, f"its position is {distance_m:.1f} m from ours")
         return Fusion(FusionState.FUSED)
 
@@ -210,8 +237,6 @@ class FusionMonitor:
             if there is None:
                 continue
             self._compared_ns = sent.at_ns
-            along = float(there.velocity @ (there.position - sent.position))
-            self._ahead_m2_s = _FORGETS * self._ahead_m2_s + along
-            self._flown_m2_s2 = _FORGETS * self._flown_m2_s2 + float(
-                there.velocity @ there.velocity
-            )
+            velocity, ahead_m = there.velocity[:2], (there.position - sent.position)[:2]
+            self._ahead_m2_s = _FORGETS * self._ahead_m2_s + float(velocity @ ahead_m)
+            self._flown_m2_s2 = _FORGETS * self._flown_m2_s2 + float(velocity @ velocity)

@@ -147,12 +147,13 @@ class EstimatorStatus(Message):
     Attributes:
         has_position: whether it has a horizontal position, relative or absolute.
         holds_position: whether it holds that for constant, having nothing to tell it by.
-        position_test_ratio: innovation of horizontal position by what may be; above 1 refused.
+        position_test_ratio: innovation of horizontal position by what may be; above 1 refused;
+            None: none was tested.
     """
 
     has_position: bool
     holds_position: bool
-    position_test_ratio: float
+    position_test_ratio: float | None
 
 
 @dataclass(frozen=True, eq=False)

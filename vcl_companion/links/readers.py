@@ -72,19 +72,21 @@ def _attitude_quaternion(m: Any, sender: _Sender) -> Message | str:
     return AttitudeSample(*sender, m.time_boot_ms, rotation, "quaternion")
 
 
-def _estimator(flags: int, ratio: float, sender: _Sender) -> Message | str:
-    if not math.isfinite(ratio):
-        return "estimator's test ratio is no number"
-    has_position = bool(flags & (_POSITION_RELATIVE | _POSITION_ABSOLUTE))
-    return EstimatorStatus(*sender, has_position, bool(flags & _POSITION_CONSTANT), ratio)
-
-
 def _ekf_status_report(m: Any, sender: _Sender) -> Message | str:
-    return _estimator(m.flags, m.pos_horiz_variance, sender)
+    if not math.isfinite(m.pos_horiz_variance):
+        return "estimator's test ratio is no number"
+    has_position = bool(m.flags & (_POSITION_RELATIVE | _POSITION_ABSOLUTE))
+    holds_position = bool(m.flags & _POSITION_CONSTANT)
+    return EstimatorStatus(*sender, has_position, holds_position, m.pos_horiz_variance)
 
 
 def _estimator_status(m: Any, sender: _Sender) -> Message | str:
-    return _estimator(m.flags, m.pos_horiz_ratio, sender)
+    has_position = bool(m.flags & (_POSITION_RELATIVE | _POSITION_ABSOLUTE))
+    # PX4 says so as well while it stands on the ground and fuses; without a position it does not.
+    holds_position = bool(m.flags & _POSITION_CONSTANT) and not has_position
+    # It sends NaN while it tests none.
+    ratio = m.pos_horiz_ratio if math.isfinite(m.pos_horiz_ratio) else None
+    return EstimatorStatus(*sender, has_position, holds_position, ratio)
 
 
 def _local_position(m: Any, sender: _Sender) -> Message | str:
