@@ -55,7 +55,7 @@ def main() -> None:
 @click.option("--out", required=True, metavar="DIR", type=_FOLDER, help="Results; made if absent.")
 @click.option(
     "--autopilot",
-    metavar="ardupilot=FILE",
+    metavar="ardupilot=FILE|px4=FOLDER",
     help="A real firmware built for simulation, in the stand-in's place.",
 )
 @click.option(

@@ -7,12 +7,18 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 from vcl_companion.errors import ConfigError
 
-Kind = Literal["ardupilot"]
+Kind = Literal["ardupilot", "px4"]
 
+# What of a build is named, and its program from there.
+_BUILT: dict[Kind, tuple[str, str]] = {
+    "ardupilot": ("build/sitl/bin/arducopter", ""),
+    "px4": ("build/px4_sitl_default", "bin/px4"),
+}
+_HEIGHT_BY_VISION = 3.0
 _NAME = re.compile(r"[A-Z][A-Z0-9_]{0,15}")
 
 
@@ -22,13 +28,18 @@ class FirmwareBinary:
 
     Attributes:
         kind: whose.
-        path: ArduPilot: ``build/sitl/bin/arducopter``.
+        path: its program.
         parameters: name and value of those that are set before it starts.
     """
 
     kind: Kind
     path: Path
     parameters: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def has_own_height(self) -> bool:
+        """Whether its height counts from where it was switched on, by a barometer."""
+        return self.kind == "px4" and dict(self.parameters).get("EKF2_HGT_REF") != _HEIGHT_BY_VISION
 
     def __str__(self) -> str:
         return f"{self.kind}={self.path}"
@@ -37,17 +48,19 @@ class FirmwareBinary:
 def parse_firmware(text: str, parameters: Sequence[str] = ()) -> FirmwareBinary:
     """Return what ``ardupilot=/path/to/arducopter`` says, and ``NAME=VALUE`` of parameters.
 
+    ``px4=`` takes the folder of a build.
+
     Raises:
         ConfigError: it has another form, or there is no such program.
     """
     name, equals, path_text = text.partition("=")
-    for kind in get_args(Kind):
+    for kind, (_, program) in _BUILT.items():
         if equals and name.strip() == kind:
-            path = Path(path_text.strip()).expanduser()
+            path = Path(path_text.strip()).expanduser() / program
             if path.is_dir() or not os.access(path, os.X_OK):
                 raise ConfigError(f"--autopilot {text}: {path} is no program")
             return FirmwareBinary(kind, path.resolve(), tuple(map(_parameter, parameters)))
-    kinds = ", ".join(f"{kind}=/path/to/its/program" for kind in get_args(Kind))
+    kinds = " or ".join(f"{kind}=/path/to/{built}" for kind, (built, _) in _BUILT.items())
     raise ConfigError(f"--autopilot {text}: expected {kinds}")
 
 

@@ -1,7 +1,8 @@
 """What a real autopilot made of our poses: its own position against the truth, beside ours.
 
 It is judged from two seconds after the first pose, and only where the firmware says that it
-has a position by what it is sent. Its local frame is the ``world`` of our poses.
+has a position by what it is sent. Its local frame is the ``world`` of our poses; where its height
+is a barometer's, that counts from elsewhere, and only how it goes is judged.
 """
 
 from __future__ import annotations
@@ -59,7 +60,12 @@ class Fused:
 
 
 def read_fused(
-    folder: Path, sent: Estimates, truth: Trajectory | None, ref_from_world: Pose | None
+    folder: Path,
+    sent: Estimates,
+    truth: Trajectory | None,
+    ref_from_world: Pose | None,
+    *,
+    has_own_height: bool = False,
 ) -> Fused | None:
     """Judge what a firmware has written of itself; None where there was none, or no truth.
 
@@ -68,6 +74,7 @@ def read_fused(
         sent: the poses as they were received.
         truth: the recording's.
         ref_from_world: by the leader's start.
+        has_own_height: whether its height counts from elsewhere.
 
     Raises:
         FlightError: a file is broken.
@@ -97,6 +104,8 @@ def read_fused(
     own_error = ref_from_world.apply(ours_m) - motion.at(sent.at_ns[ours]).positions_m
     true = motion.at(at_ns[theirs])
     error = ref_from_world.apply(positions[theirs]) - true.positions_m
+    if has_own_height:
+        error[:, 2] -= np.median(error[:, 2])
     ate_m, own_ate_m = _rms(error), _rms(own_error)
     speeds = true.velocities_m_s
     moved = float(np.sum(speeds**2))

@@ -76,6 +76,10 @@ def plan_live(scenario: Scenario, out: Path, options: FlyOptions) -> FlightPlan:
     """
     if options.firmware is None:
         raise ConfigError("a live flight takes a real --autopilot: the stand-in does not fly")
+    if options.firmware.kind != "ardupilot":
+        raise ConfigError(
+            "a live flight takes --autopilot ardupilot=FILE: PX4 flies recordings alone"
+        )
     missions = {}
     drones = []
     for drone in scenario.drone:

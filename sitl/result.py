@@ -168,6 +168,7 @@ def gather(plan: FlightPlan, out: Path, events: Iterable[Event] = ()) -> FlightR
     }
     network = read_network_log(out)
     alignment = _alignment(*heard[plan.leader], truths[plan.leader])
+    firmware = plan.options.firmware
     drones = tuple(
         _drone_result(
             d,
@@ -178,6 +179,7 @@ def gather(plan: FlightPlan, out: Path, events: Iterable[Event] = ()) -> FlightR
             logs[d.name],
             alignment,
             lives.get(d.name),
+            has_own_height=firmware is not None and firmware.has_own_height,
         )
         for d in plan.drones
     )
@@ -211,6 +213,8 @@ def _drone_result(
     log: FlightLog,
     alignment: Pose | None,
     lives: Lives | None,
+    *,
+    has_own_height: bool,
 ) -> DroneResult:
     errors = None
     every = range(len(planned.drone.frames))
@@ -230,7 +234,13 @@ def _drone_result(
         n_between=len(between.at_ns),
         between=None if alignment is None else _between(planned, between, alignment, axes),
         alone={} if alignment is None else _alone(planned, truth, log, alignment, axes),
-        fused=read_fused(out / planned.name, estimates, planned.drone.truth, alignment),
+        fused=read_fused(
+            out / planned.name,
+            estimates,
+            planned.drone.truth,
+            alignment,
+            has_own_height=has_own_height,
+        ),
         mission=read_mission(out / planned.name, planned.drone.truth, alignment),
         given=np.array(every if lives is None else lives.frames, dtype=np.int64),
         lives=() if lives is None else tuple(lives.lives),

@@ -12,7 +12,6 @@ import struct
 import sys
 import time
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +125,7 @@ def main(arguments: list[str]) -> int:
         own = RECORDED
         if isinstance(options.flies, Orders):
             own = of_a_mission(options.flies.mission.speed_m_s)
-        return replace(options, parameters={**own, **options.parameters})
+        return options.over(own)
 
     return run_flown("ardupilot", arguments, read, start)
 

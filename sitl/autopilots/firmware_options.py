@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,10 @@ class FirmwareOptions:
     speed: float
     out: Path
     run: Path
+
+    def over(self, parameters: Mapping[str, float]) -> FirmwareOptions:
+        """Return the same with parameters that are set where it does not name them itself."""
+        return replace(self, parameters={**parameters, **self.parameters})
 
 
 def read_options(path: Path) -> FirmwareOptions:

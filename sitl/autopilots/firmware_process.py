@@ -56,11 +56,18 @@ class FirmwareProcess:
         Raises:
             ConfigError: it has ended, or has not answered for too long.
         """
-        code = self._process.poll()
-        if code is not None:
-            raise ConfigError(f"the firmware ended with exit code {code}; see {self._log}")
+        if self._process.poll() is not None:
+            raise ConfigError(self.obituary())
         if time.monotonic() - asked_at_s > _ANSWERS_WITHIN_S:
             raise ConfigError(f"the firmware does not answer; see {self._log}")
+
+    def obituary(self) -> str:
+        """Say in one line how it ended; one that hung up is waited for."""
+        try:
+            code = self._process.wait(_ENDS_WITHIN_S)
+        except subprocess.TimeoutExpired:
+            return f"the firmware has hung up its simulator; see {self._log}"
+        return f"the firmware ended with exit code {code}; see {self._log}"
 
     def _end(self) -> None:
         self._process.terminate()

@@ -51,7 +51,7 @@ class RecordedMotion:
     """
 
     def __init__(self, at_ns: NDArray[np.int64], positions_m: Array, quaternions: Array) -> None:
-        self._starts_ns = int(at_ns[0])
+        self.starts_ns = int(at_ns[0])
         since_s = (at_ns - at_ns[0]) * 1e-9
         self._ends_s = float(since_s[-1])
         self._position = CubicSpline(since_s, positions_m, bc_type="natural")
@@ -60,7 +60,7 @@ class RecordedMotion:
 
     def at(self, at_ns: NDArray[np.int64]) -> Motion:
         """Return the motion at some instants; after the last pose it stays where it was there."""
-        since_s = np.asarray((at_ns - self._starts_ns) * 1e-9, dtype=np.float64)
+        since_s = np.asarray((at_ns - self.starts_ns) * 1e-9, dtype=np.float64)
         within_s = np.clip(since_s, 0.0, self._ends_s)
         flies = (since_s <= self._ends_s).astype(float)[:, None]
         share, to_come_s, growth = _taken_up(since_s, _SPEED_TAKEN_UP_S)

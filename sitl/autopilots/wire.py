@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import select
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -17,6 +18,15 @@ class Wire:
         self.socket: socket.socket = stack.enter_context(open_udp())
         self.port = int(self.socket.getsockname()[1])
         self._firmware_at: tuple[str, int] | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it has spoken."""
+        return self._firmware_at is not None
+
+    def wait(self, seconds: float) -> None:
+        """Wait until it says something, for so long at most."""
+        select.select([self.socket], [], [], seconds)
 
     def write(self, frame: bytes) -> None:
         """Send a frame to the firmware; one that has not spoken yet cannot be reached."""

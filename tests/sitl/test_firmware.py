@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from sitl.autopilots.attitude_source import read_table
 from sitl.autopilots.firmware_options import read_options
 from sitl.evaluation import Estimates
 from sitl.firmware import FirmwareBinary, parse_firmware
@@ -29,20 +31,35 @@ def quiet(*_: object) -> None:
     pass
 
 
-@pytest.fixture
-def vehicle(tmp_path: Path) -> Path:
-    """The program of ``json_vehicle`` where a firmware's binary would be."""
-    path = tmp_path / "arducopter"
-    script = ROOT / "tests" / "sitl" / "json_vehicle.py"
+def program(path: Path, name: str) -> None:
+    """Put a program of these tests where a firmware's binary would be."""
+    script = ROOT / "tests" / "sitl" / name
     path.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{script}" "$@"\n')
     path.chmod(0o755)
+
+
+@pytest.fixture
+def vehicle(tmp_path: Path) -> Path:
+    path = tmp_path / "arducopter"
+    program(path, "json_vehicle.py")
     return path
+
+
+@pytest.fixture
+def build(tmp_path: Path) -> Path:
+    """A folder like that of a PX4 built for simulation."""
+    folder = tmp_path / "px4_sitl_default"
+    for inner in ("bin", "etc/init.d-posix"):
+        (folder / inner).mkdir(parents=True)
+    (folder / "etc" / "init.d-posix" / "rcS").touch()
+    program(folder / "bin" / "px4", "lockstep_vehicle.py")
+    return folder
 
 
 def flown(tmp_path: Path, firmware: FirmwareBinary, speed: float) -> dict[str, dict[str, float]]:
     options = FlyOptions(speed=speed, firmware=firmware)
     report = fly(DEMO, tmp_path / "out", options, quiet)
-    assert report["options"]["autopilot"] == "ardupilot"
+    assert report["options"]["autopilot"] == firmware.kind
     for name, drone in report["drones"].items():
         assert drone["localized_share"] == 1.0, name
         assert drone["unaccounted"] == 0
@@ -68,17 +85,51 @@ def test_a_flight_moves_a_firmware_s_sensors_and_hands_it_our_poses(
     assert "What the autopilots made of it" in page
 
 
-def test_a_firmware_that_does_not_run_ends_the_flight_in_one_line(tmp_path: Path) -> None:
-    broken = tmp_path / "arducopter"
-    broken.write_text("#!/bin/sh\necho no such thing >&2\nexit 3\n")
-    broken.chmod(0o755)
+def test_a_flight_moves_px4_s_sensors_and_hands_it_our_poses_and_the_time(
+    tmp_path: Path, build: Path
+) -> None:
+    fused = flown(tmp_path, parse_firmware(f"px4={build}"), math.inf)
+    for name, said in fused.items():
+        assert said["fused_after_s"] < 1.5
+        # It holds each pose until the next: what it is off by is the way between, and no more.
+        assert said["own_ate_m"] < 0.05
+        assert said["ate_m"] < 1.0
+        status = read_status(tmp_path / "out" / "run" / name / "status.json")
+        assert status.autopilot.firmware == "px4"
+        measured = read_table(tmp_path / "out" / name / "attitude.csv", 5)
+        true = read_table(tmp_path / "out" / "run" / name / "truth.csv", 8)
+        turned = Rotation.from_quat(np.roll(measured[1], -1, axis=1)[-1])
+        off = turned.inv() * Rotation.from_quat(np.roll(true[1][:, 3:], -1, axis=1)[-1])
+        assert np.rad2deg(off.magnitude()) < 1.5
+
+
+def test_a_folder_without_px4_s_scripts_ends_the_flight_in_one_line(
+    tmp_path: Path, build: Path
+) -> None:
+    (build / "etc" / "init.d-posix" / "rcS").unlink()
+    with pytest.raises(VclError, match=r"px4_sitl_default: has no etc/init\.d-posix/rcS") as raised:
+        fly(DEMO, tmp_path / "out", FlyOptions(firmware=parse_firmware(f"px4={build}")), quiet)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+def test_a_firmware_that_does_not_run_ends_the_flight_in_one_line(
+    tmp_path: Path, build: Path, kind: str
+) -> None:
+    binary = build / "bin" / "px4"
+    binary.write_text("#!/bin/sh\necho no such thing >&2\nexit 3\n")
+    firmware = parse_firmware(f"{kind}={build if kind == 'px4' else binary}")
     with pytest.raises(VclError, match=r"firmware ended with exit code 3.*firmware\.log") as raised:
-        fly(
-            DEMO,
-            tmp_path / "out",
-            FlyOptions(firmware=parse_firmware(f"ardupilot={broken}")),
-            quiet,
-        )
+        fly(DEMO, tmp_path / "out", FlyOptions(firmware=firmware), quiet)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_px4_that_dies_in_flight_ends_the_flight_in_one_line(
+    tmp_path: Path, build: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DIES_AFTER_STEPS", "1000")
+    with pytest.raises(VclError, match=r"firmware ended with exit code 4.*firmware\.log") as raised:
+        fly(DEMO, tmp_path / "out", FlyOptions(firmware=parse_firmware(f"px4={build}")), quiet)
     assert "\n" not in str(raised.value)
 
 
@@ -100,6 +151,7 @@ def test_a_real_arducopter_fuses_our_poses(tmp_path: Path) -> None:
         ("betaflight=/bin/true", (), "expected"),
         ("ardupilot=/no/such/file", (), "is no program"),
         ("ardupilot=/tmp", (), "is no program"),
+        ("px4=/tmp", (), "bin/px4 is no program"),
         ("ardupilot=/bin/true", ("VISO_DELAY_MS",), "NAME=NUMBER"),
         ("ardupilot=/bin/true", ("viso=1",), "NAME=NUMBER"),
         ("ardupilot=/bin/true", ("VISO_TYPE=much",), "NAME=NUMBER"),
