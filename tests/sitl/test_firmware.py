@@ -197,3 +197,27 @@ def test_what_a_firmware_was_never_sent_it_has_not_fused(tmp_path: Path) -> None
     assert some.fused_after_s == 1.0
     assert some.ate_m == 1.0
     assert np.isclose(some.fused_share, 3.0 / 9.9)
+
+
+def test_a_height_that_counts_from_elsewhere_is_judged_by_how_it_goes(tmp_path: Path) -> None:
+    at_ns = np.arange(0, 10_000_000_000, 100_000_000, dtype=np.int64)
+    still = Trajectory(at_ns, np.zeros((100, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (100, 1)))
+    sent = Estimates(at_ns, (Pose.identity(),) * 100, np.zeros((100, 6, 6)))
+    heights = np.where(np.arange(100) % 2, 7.1, 6.9)
+    rows = zip(at_ns.tolist(), heights.tolist(), strict=True)
+    (tmp_path / "fused.csv").write_text(
+        "at_ns,x,y,z\n" + "".join(f"{t},0,0,{z}\n" for t, z in rows)
+    )
+    (tmp_path / "said.csv").write_text('at_ns,severity,text\n0,6,"estimator flags 0x12f"\n')
+    as_it_is = read_fused(tmp_path, sent, still, Pose.identity())
+    as_it_goes = read_fused(tmp_path, sent, still, Pose.identity(), has_own_height=True)
+    assert as_it_is is not None
+    assert as_it_goes is not None
+    assert as_it_is.ate_m == pytest.approx(7.0, abs=0.01)
+    assert as_it_goes.ate_m == pytest.approx(0.1, abs=0.003)
+
+
+def test_px4_s_height_is_its_own_unless_vision_gives_it(build: Path) -> None:
+    assert parse_firmware(f"px4={build}").has_own_height
+    assert not parse_firmware(f"px4={build}", ("EKF2_HGT_REF=3",)).has_own_height
+    assert not parse_firmware(f"ardupilot={build / 'bin' / 'px4'}").has_own_height
