@@ -12,6 +12,7 @@ from collections.abc import Callable, Coroutine, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from sitl.firmware import parse_firmware
 from vcl_companion.clock import ManualClock
 from vcl_companion.daemon.parameter_rules import findings, names_of, rules_for
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.rotation import Array, matrix_from_quaternion
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.fusion import FusionState
@@ -46,6 +47,7 @@ class Real:
         variable: of the environment, that says where it is.
         booted_before_ns: how long it has run before the first pose.
         has_own_height: whether its height is a barometer's, from where it was switched on.
+        message: what it is sent.
     """
 
     kind: str
@@ -54,6 +56,7 @@ class Real:
     variable: str
     booted_before_ns: int
     has_own_height: bool
+    message: Literal["vision_position_estimate", "odometry"] = "vision_position_estimate"
 
 
 ARDUPILOT = Real(
@@ -85,10 +88,11 @@ BEGINS_AT = np.array([2.0, 2.7, -1.5])
 
 
 def motion(starts_ns: int = START_NS) -> RecordedMotion:
-    """A minute and a half of wide turns at up to 1.6 m/s, away from the origin."""
+    """A minute and a half of wide turns at up to 1.6 m/s, away from the origin, looking around."""
     t = np.arange(0.0, 90.0, 0.1)
     positions = BEGINS_AT + np.c_[4.0 * np.sin(0.4 * t), 2.0 * np.cos(0.4 * t) - 2.0, -0.1 * t]
-    level = np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))
+    half_rad = 0.5 * (0.6 + 0.5 * np.sin(0.3 * t))
+    level = np.c_[np.cos(half_rad), 0.0 * t, 0.0 * t, np.sin(half_rad)]
     return RecordedMotion(starts_ns + np.round(t * 1e9).astype(np.int64), positions, level)
 
 
@@ -98,7 +102,7 @@ class Flight:
     def __init__(self, real: Real, autopilot: Flown, port: int, true: RecordedMotion) -> None:
         self._real = real
         self.clock = ManualClock(START_NS)
-        options = AutopilotOptions(link=f"udp:127.0.0.1:{port}")
+        options = AutopilotOptions(link=f"udp:127.0.0.1:{port}", message=real.message)
         self.link = AutopilotLink(options, SYSTEM, self.clock)
         self.off = np.zeros(3)
         self.n_resets = 0
@@ -124,7 +128,8 @@ class Flight:
 
     def _send(self, at_ns: int) -> None:
         there = self._true.at(np.array([at_ns], dtype=np.int64))
-        told = Pose(np.eye(3), there.positions_m[0] + self.off)
+        turn = matrix_from_quaternion(there.quaternions[0])
+        told = Pose(turn, there.positions_m[0] + self.off)
         covariance = np.diag([SIGMA_M**2] * 3 + [1e-4] * 3)
         estimate = PoseEstimate(
             told, covariance, there.velocities_m_s[0], 0.01 * np.eye(3), at_ns, self.n_resets
@@ -281,6 +286,19 @@ def test_the_parameters_that_we_fly_by_are_read_and_set(real: Real, tmp_path: Pa
         await asked
 
     flown(real, tmp_path, scenario)
+
+
+@pytest.mark.skipif(not os.environ.get("VCL_PX4"), reason="VCL_PX4 names no firmware")
+def test_px4_takes_a_velocity_with_our_poses(tmp_path: Path) -> None:
+    async def scenario(flight: Flight, fused: Path) -> None:
+        await flight.fly(2.0)
+        await flight.fly(28.0)
+        assert flight.states == [FusionState.FUSED]
+        assert flight.apart_m(fused).max() < 0.05
+
+    # Velocity as well as position, height and heading.
+    parameters = {**px4.PARAMETERS, "EKF2_EV_CTRL": 15.0}
+    flown(replace(PX4, parameters=parameters, message="odometry"), tmp_path, scenario)
 
 
 @pytest.mark.skipif(not os.environ.get("VCL_PX4"), reason="VCL_PX4 names no firmware")
