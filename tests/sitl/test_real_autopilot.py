@@ -8,67 +8,31 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Callable, Coroutine, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from sitl.autopilots import ardupilot, px4
-from sitl.autopilots.ardupilot_parameters import RECORDED
+from sitl.autopilots import px4
 from sitl.autopilots.firmware_options import FirmwareOptions
-from sitl.autopilots.flown import Firmware, Flown, Start
-from sitl.autopilots.motion import RecordedMotion
-from sitl.autopilots.steered import open_udp
+from sitl.autopilots.flown import Firmware
 from sitl.autopilots.wire import Wire
-from sitl.firmware import parse_firmware
-from vcl_companion.clock import ManualClock
-from vcl_companion.daemon.parameter_rules import findings, names_of, rules_for
-from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, matrix_from_quaternion
-from vcl_companion.links.autopilot import AutopilotLink
-from vcl_companion.links.autopilot_options import AutopilotOptions
-from vcl_companion.links.fusion import FusionState
-from vcl_companion.links.vision_pose import PoseEstimate
-
-
-@dataclass(frozen=True)
-class Real:
-    """A firmware that these tests fly.
-
-    Attributes:
-        kind: whose.
-        start: starts it.
-        parameters: set before.
-        variable: of the environment, that says where it is.
-        booted_before_ns: how long it has run before the first pose.
-        has_own_height: whether its height is a barometer's, from where it was switched on.
-        message: what it is sent.
-    """
-
-    kind: str
-    start: Start
-    parameters: Mapping[str, float]
-    variable: str
-    booted_before_ns: int
-    has_own_height: bool
-    message: Literal["vision_position_estimate", "odometry"] = "vision_position_estimate"
-
-
-ARDUPILOT = Real(
-    "ardupilot",
-    ardupilot.start,
-    RECORDED,
-    "VCL_ARDUPILOT",
-    40_000_000_000,
-    has_own_height=False,
+from tests.sitl.real_firmware import (
+    ARDUPILOT,
+    IN_GUIDED,
+    PERIOD_NS,
+    PX4,
+    START_NS,
+    Flight,
+    Real,
+    flown,
 )
-# By the first pose it has our clock.
-PX4 = Real("px4", px4.Px4, px4.PARAMETERS, "VCL_PX4", 60_000_000_000, has_own_height=True)
+from vcl_companion.daemon.parameter_rules import findings, names_of, rules_for
+from vcl_companion.daemon.resets import Resets
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.links.fusion import FusionState
 
 
 @pytest.fixture(params=[ARDUPILOT, PX4], ids=lambda real: real.kind)
@@ -77,124 +41,6 @@ def real(request: pytest.FixtureRequest) -> Real:
     if not os.environ.get(wanted.variable):
         pytest.skip(f"{wanted.variable} names no firmware")
     return wanted
-
-
-SYSTEM = 2
-START_NS = 1_000_000_000_000
-STEP_NS = 20_000_000
-PERIOD_NS = 100_000_000
-SIGMA_M = 0.02
-BEGINS_AT = np.array([2.0, 2.7, -1.5])
-
-
-def motion(starts_ns: int = START_NS) -> RecordedMotion:
-    """A minute and a half of wide turns at up to 1.6 m/s, away from the origin, looking around."""
-    t = np.arange(0.0, 90.0, 0.1)
-    positions = BEGINS_AT + np.c_[4.0 * np.sin(0.4 * t), 2.0 * np.cos(0.4 * t) - 2.0, -0.1 * t]
-    half_rad = 0.5 * (0.6 + 0.5 * np.sin(0.3 * t))
-    level = np.c_[np.cos(half_rad), 0.0 * t, 0.0 * t, np.sin(half_rad)]
-    return RecordedMotion(starts_ns + np.round(t * 1e9).astype(np.int64), positions, level)
-
-
-class Flight:
-    """The firmware, our link to it, and a drone that knows where it is."""
-
-    def __init__(self, real: Real, autopilot: Flown, port: int, true: RecordedMotion) -> None:
-        self._real = real
-        self.clock = ManualClock(START_NS)
-        options = AutopilotOptions(link=f"udp:127.0.0.1:{port}", message=real.message)
-        self.link = AutopilotLink(options, SYSTEM, self.clock)
-        self.off = np.zeros(3)
-        self.n_resets = 0
-        self.step_ns, self.late_ns = STEP_NS, 0
-        self.states: list[FusionState] = []
-        self._autopilot = autopilot
-        self._true = true
-
-    async def fly(self, seconds: float, *, sends: bool = True) -> None:
-        """Go on for so long, told where it is ten times a second."""
-        until_ns = self.clock.now_ns() + round(seconds * 1e9)
-        self.states = []
-        while self.clock.now_ns() < until_ns:
-            now_ns = self.clock.now_ns() + self.step_ns
-            self._autopilot.advance_to(now_ns)
-            self.clock.advance_to(now_ns)
-            if sends and now_ns % PERIOD_NS == 0:
-                self._send(now_ns - self.late_ns)
-            await asyncio.sleep(0.002)
-            state = self.link.fusion().state
-            if not self.states or self.states[-1] is not state:
-                self.states.append(state)
-
-    def _send(self, at_ns: int) -> None:
-        there = self._true.at(np.array([at_ns], dtype=np.int64))
-        turn = matrix_from_quaternion(there.quaternions[0])
-        told = Pose(turn, there.positions_m[0] + self.off)
-        covariance = np.diag([SIGMA_M**2] * 3 + [1e-4] * 3)
-        estimate = PoseEstimate(
-            told, covariance, there.velocities_m_s[0], 0.01 * np.eye(3), at_ns, self.n_resets
-        )
-        assert self.link.send_pose(estimate) is None
-
-    def behind_s(self, fused: Path) -> float:
-        """Return by how much its position was that of an earlier instant, in the last second."""
-        times, believed = self._lately(fused)
-        true = self._true.at(times)
-        speeds = true.velocities_m_s[:, :2]
-        behind = true.positions_m[:, :2] - believed[:, :2]
-        return float(np.sum(speeds * behind) / np.sum(speeds**2))
-
-    def apart_m(self, fused: Path) -> Array:
-        """Return (T,) how far it was from where it was told to be, in the last second."""
-        return self.apart(fused)[1]
-
-    def apart(self, fused: Path) -> tuple[NDArray[np.int64], Array]:
-        """Return (T,) instants of the last second, and how far it was then from where it was told.
-
-        Where its height is its own, that has to go as ours goes.
-        """
-        times, believed = self._lately(fused)
-        apart = believed - self._true.at(times).positions_m - self.off
-        if self._real.has_own_height:
-            apart[:, 2] -= np.median(apart[:, 2])
-        return times, np.asarray(np.linalg.norm(apart, axis=1))
-
-    def _lately(self, fused: Path) -> tuple[NDArray[np.int64], Array]:
-        rows = [line.split(",") for line in fused.read_text().splitlines()[-60:]]
-        times = np.array([int(row[0]) for row in rows])
-        believed = np.array([[float(value) for value in row[1:]] for row in rows])
-        lately = times > self.clock.now_ns() - 1_000_000_000
-        return times[lately], believed[lately]
-
-
-def flown(
-    real: Real,
-    tmp_path: Path,
-    scenario: Callable[[Flight, Path], Coroutine[None, None, None]],
-    moves_from_ns: int = START_NS,
-) -> None:
-    true = motion(moves_from_ns)
-    out = tmp_path / "mav1"
-    binary = parse_firmware(f"{real.kind}={os.environ[real.variable]}").path
-    options = FirmwareOptions(
-        binary, SYSTEM, START_NS - real.booted_before_ns, true, real.parameters, 0.0, out,
-        tmp_path / "firmware",
-    )  # fmt: skip
-    with ExitStack() as stack:
-        udp = stack.enter_context(open_udp())
-        autopilot = Flown(options, real.start, udp, stack)
-        autopilot.advance_to(START_NS)
-
-        async def run() -> None:
-            flight = Flight(real, autopilot, udp.getsockname()[1], true)
-            async with asyncio.timeout(120.0):
-                link = asyncio.ensure_future(flight.link.run())
-                try:
-                    await scenario(flight, out / "fused.csv")
-                finally:
-                    link.cancel()
-
-        asyncio.run(run())
 
 
 def test_poses_are_fused_within_two_seconds_wherever_they_begin(real: Real, tmp_path: Path) -> None:
@@ -317,3 +163,71 @@ def test_px4_takes_our_instants_once_we_have_told_it_the_time(tmp_path: Path) ->
         assert flight.states == [FusionState.FUSED]
 
     flown(replace(PX4, start=start, booted_before_ns=25_000_000_000), tmp_path, scenario)
+
+
+@pytest.mark.skipif(not os.environ.get("VCL_ARDUPILOT"), reason="VCL_ARDUPILOT names no firmware")
+def test_an_arducopter_follows_a_slide_without_a_reset(tmp_path: Path) -> None:
+    async def scenario(flight: Flight, fused: Path) -> None:
+        await flight.fly(10.0)
+        told: list[str] = []
+        flight.slide = Resets("blend", 0.3, 0.1, lambda what, _: told.append(what))
+        flight.slide.decide(Pose.identity(), np.eye(6), 0, 0, None, IN_GUIDED, was_silent=False)
+        flight.off = np.array([1.8, -2.4, 0.0])
+        while len(told) < 2:
+            await flight.fly(1.0)
+            assert flight.states == [FusionState.FUSED]
+            assert np.linalg.norm(flight.off_m(fused) - flight.slid) < 0.15
+        assert flight.n_resets == flight.slide.n_resets == 0
+        await flight.fly(3.0)
+        assert flight.apart_m(fused).max() < 0.1
+
+    flown(ARDUPILOT, tmp_path, scenario)
+
+
+@pytest.mark.skipif(not os.environ.get("VCL_ARDUPILOT"), reason="VCL_ARDUPILOT names no firmware")
+def test_told_its_origin_before_poses_it_knows_its_global_position_by_them(tmp_path: Path) -> None:
+    origin = (47.397742, 8.545594, 488.0)
+
+    async def scenario(flight: Flight, fused: Path) -> None:
+        places, heard = (fused.with_name(name) for name in ("global.csv", "received.jsonl"))
+        # Another drone's local frame: 30 m north, 20 m west and 2 m above of the leader's.
+        flight.origin_world = np.array([30.0, -20.0, -2.0])
+        assert places.read_text() == ""
+        while "VCL origin set" not in heard.read_text():
+            assert flight.clock.now_ns() < START_NS + 20_000_000_000
+            await flight.fly(1.0, sends=False)
+        await flight.fly(2.0)
+        assert flight.link.fusion().state is FusionState.FUSED
+        await flight.fly(25.0)
+        assert flight.states == [FusionState.FUSED]
+        assert flight.apart_m(fused).max() < 0.1
+        at_ns, latitude, longitude, altitude = map(
+            float, places.read_text().splitlines()[-1].split(",")
+        )
+        there = flight.true_at(round(at_ns)) + flight.origin_world
+        metres_per_deg = 111_318.845  # by LOCATION_SCALING_FACTOR
+        off_m = [
+            (latitude - origin[0]) * metres_per_deg - there[0],
+            (longitude - origin[1]) * metres_per_deg * np.cos(np.deg2rad(origin[0])) - there[1],
+            altitude - origin[2] + there[2],
+        ]
+        assert np.abs(off_m).max() < 0.3, off_m
+
+    flown(ARDUPILOT, tmp_path, scenario, origin=origin, rests_s=20.0)
+
+
+@pytest.mark.skipif(not os.environ.get("VCL_ARDUPILOT"), reason="VCL_ARDUPILOT names no firmware")
+def test_an_origin_that_would_throw_its_height_waits(tmp_path: Path) -> None:
+    async def scenario(flight: Flight, fused: Path) -> None:
+        heard = fused.with_name("received.jsonl")
+        await flight.fly(10.0)
+        flight.origin_world = np.zeros(3)
+        while "VCL origin waits until armed" not in heard.read_text():
+            assert flight.clock.now_ns() < START_NS + 40_000_000_000
+            await flight.fly(1.0)
+        await flight.fly(5.0)
+        assert flight.states == [FusionState.FUSED]
+        assert flight.apart_m(fused).max() < 0.1
+        assert '"COMMAND_INT"' not in heard.read_text()
+
+    flown(ARDUPILOT, tmp_path, scenario, origin=(47.397742, 8.545594, 488.0))
