@@ -268,6 +268,13 @@ def fly(
     "--drones", default="", metavar="mav0,mav1", help="Only these fly; otherwise all of them."
 )
 @click.option(
+    "--map",
+    "map_of",
+    metavar="DIR",
+    type=_FOLDER,
+    help="Begin with the last map of an earlier flight: its --out. One drone alone needs one.",
+)
+@click.option(
     "--start-timeout",
     default=60.0,
     show_default=True,
@@ -288,6 +295,7 @@ def live(
     parameters: tuple[str, ...],
     speed: float,
     drones: str,
+    map_of: Path | None,
     start_timeout: float,
     settings: tuple[str, ...],
 ) -> None:
@@ -314,7 +322,7 @@ def live(
     )
     console = Console()
     with progress_shown(console) as progress:
-        report = fly_live(load_scenario(scenario), out, options, progress)
+        report = fly_live(load_scenario(scenario), out, options, progress, map_of)
     show_report(console, report, out)
 
 

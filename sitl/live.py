@@ -8,6 +8,7 @@ may be flown again.
 from __future__ import annotations
 
 import asyncio
+import json
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,6 +26,7 @@ from sitl.renderer import Renderer
 from sitl.scenario import Scenario
 from sitl.swarm import Swarm
 from sitl.town import build_town
+from vcl_companion.daemon.map_store import SAVED_FILE
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.recording import (
@@ -42,9 +44,20 @@ from vcl_companion.recording import (
 
 
 def fly_live(
-    scenario: Scenario, out: Path, options: FlyOptions, progress: Progress
+    scenario: Scenario,
+    out: Path,
+    options: FlyOptions,
+    progress: Progress,
+    map_of: Path | None = None,
 ) -> dict[str, Any]:
     """Fly the missions of a scenario, and return what report.json says.
+
+    Args:
+        scenario: the town, the cameras, the missions.
+        out: for all that is left of it.
+        options: how it is flown.
+        progress: told of it.
+        map_of: output folder of an earlier flight; the drones begin with its last map.
 
     Raises:
         VclError: the scenario or an option cannot be used.
@@ -52,9 +65,13 @@ def fly_live(
         KeyboardInterrupt: likewise, on Ctrl-C.
     """
     plan = plan_live(scenario, out, options)
+    stored = None if map_of is None else _last_map(map_of)
     prepare_folder(out, plan)
     for planned in plan.drones:
-        write_sensor(out / "run" / planned.name / "sensor.yaml", planned.drone.sensor)
+        run = out / "run" / planned.name
+        write_sensor(run / "sensor.yaml", planned.drone.sensor)
+        if stored is not None:
+            (run / "maps" / SAVED_FILE).write_bytes(stored)
     progress("building the town", 0, 0)
     recording = plan.recording
     description = Description(
@@ -66,6 +83,22 @@ def fly_live(
         conduct = flown(plan, out, shots, progress)
         shots.leave_truth()
     return reported(_as_flown(plan), out, conduct, progress)
+
+
+def _last_map(flight: Path) -> bytes:
+    """Return the last map of a flight that came from far enough to leave a report.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    try:
+        said = json.loads((flight / "report.json").read_text("utf-8"))
+        leader, revision = said["options"]["leader"], said["map"]["revision"]
+        return (flight / "run" / leader / "maps" / f"{revision}.vclmap").read_bytes()
+    except OSError as error:
+        raise ConfigError(f"--map {flight}: {error.filename}: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"--map {flight}: its report.json tells of no map") from error
 
 
 def plan_live(scenario: Scenario, out: Path, options: FlyOptions) -> FlightPlan:

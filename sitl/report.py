@@ -31,7 +31,7 @@ Terms beyond ``sitl.evaluation``'s:
   lived, and answered; ``peer_bytes_sent`` and the load are the last run's.
 * ``peer_bytes_per_s``: sent to the other drones, per second of recording time.
 * ``peer_link``: the same by message, and what became of it (``sitl.network_report``).
-* ``map``: the leader's last revision; ``revisions`` counts all of them.
+* ``map``: the leader's last ``revision``; ``revisions`` counts all of them.
 """
 
 from __future__ import annotations
@@ -114,6 +114,7 @@ def report_of(result: FlightResult) -> dict[str, Any]:
             for drone in result.drones
         },
         "map": {
+            "revision": last_map.revision if last_map else None,
             "revisions": len({row.revision for row in result.maps}),
             "landmarks": last_map.landmarks if last_map else 0,
             "bytes": last_map.bytes if last_map else 0,

@@ -124,6 +124,10 @@ def test_a_scenario_with_missions_is_flown_and_one_with_flights_rendered(tmp_pat
     assert "no scenario 'squares'" in said("live", "squares", *autopilot)
     assert "is no program" in said("live", "square", "--autopilot", f"ardupilot={tmp_path}/no")
     assert "has no 'mav9'" in said("live", "square", *autopilot, "--drones", "mav9")
+    live = ("live", "square", *autopilot, "--drones", "mav0", "--map", str(tmp_path))
+    assert f"{tmp_path}/report.json: No such file" in said(*live)
+    (tmp_path / "report.json").write_text('{"options": {"leader": "mav0"}}')
+    assert "its report.json tells of no map" in said(*live)
 
 
 def test_a_drone_has_a_flight_or_a_mission_and_not_both(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from vcl_companion.wire.map_codec import revision_of
 _log = logging.getLogger(__name__)
 
 _MAX_LEFT = 256  # revisions remembered by name
-_SAVED = "saved.vclmap"
+SAVED_FILE = "saved.vclmap"
 # Several times the longest of maps; a file that is longer is something else.
 _MAX_FILE_BYTES = 64 << 20
 
@@ -187,7 +187,7 @@ class MapStore:
     @property
     def saved_file(self) -> Path | None:
         """The map to begin with after a restart, if there is one; None without a directory."""
-        return None if self._directory is None else self._directory / _SAVED
+        return None if self._directory is None else self._directory / SAVED_FILE
 
     def save(self, stored: StoredMap) -> None:
         """Write a revision down to begin with, in the place of any other; any thread may.
