@@ -93,7 +93,7 @@ def _last_map(flight: Path) -> bytes:
     """
     try:
         said = json.loads((flight / "report.json").read_text("utf-8"))
-        leader, revision = said["options"]["leader"], said["map"]["revision"]
+        leader, revision = str(said["options"]["leader"]), str(said["map"]["revision"])
         return (flight / "run" / leader / "maps" / f"{revision}.vclmap").read_bytes()
     except OSError as error:
         raise ConfigError(f"--map {flight}: {error.filename}: {error.strerror}") from error

@@ -8,7 +8,7 @@ import sys
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -422,6 +422,9 @@ async def overheard(port: int, opinion: SecondOpinion) -> AsyncIterator[int]:
             yield near.port
 
 
+VELOCITY = np.array([2.0, -1.0, 0.3])
+
+
 def poses() -> list[tuple[Pose, Array, int, int]]:
     rng = np.random.default_rng(8)
     out = []
@@ -450,19 +453,24 @@ def assert_is(fields: dict[str, Any], sent: tuple[Pose, Array, int, int]) -> Non
     assert all(fields["covariance"][k] > 0.0 for k in (0, 6, 11, 15, 18, 20))
 
 
-def test_mavsdk_and_the_stand_in_decode_the_same(tmp_path: Path) -> None:
-    out = tmp_path / "mav"
+def overheard_poses(
+    tmp_path: Path, message: Literal["vision_position_estimate", "odometry"]
+) -> list[Told]:
+    """Send ``poses`` to the stand-in; return what MAVSDK made of them, and of a heartbeat last."""
     clock = ManualClock(START_NS)
     told: list[Told] = []
 
     async def scenario() -> None:
         with second_opinion() as opinion:
             async with (
-                stand_in(out, truth(tmp_path)) as process,
+                stand_in(tmp_path / "mav", truth(tmp_path)) as process,
                 overheard(process.port, opinion) as port,
             ):
                 await process.advance_to(START_NS)
-                link = link_to(port, clock)
+                options = AutopilotOptions(
+                    link=f"udp:127.0.0.1:{port}", message=message, time_error_s=0.0
+                )
+                link = AutopilotLink(options, SYSTEM, clock)
                 link.set_state(ServiceState.ACTIVE)
                 async with running(link.run()):
                     await opinion.meet()
@@ -471,15 +479,21 @@ def test_mavsdk_and_the_stand_in_decode_the_same(tmp_path: Path) -> None:
                     for pose, covariance, at_ns, reset_counter in poses():
                         sent = link.send_pose(
                             PoseEstimate(
-                                pose, covariance, np.zeros(3), np.eye(3), at_ns, reset_counter
+                                pose, covariance, VELOCITY, np.eye(3), at_ns, reset_counter
                             )
                         )
                         assert sent is None
-                        told.append(await opinion.next_of("VISION_POSITION_ESTIMATE"))
+                        told.append(await opinion.next_of(message.upper()))
                     told.append(await opinion.next_of("HEARTBEAT"))
                 await process.finish()
 
     asyncio.run(scenario())
+    return told
+
+
+def test_mavsdk_and_the_stand_in_decode_the_same(tmp_path: Path) -> None:
+    out = tmp_path / "mav"
+    told = overheard_poses(tmp_path, "vision_position_estimate")
     *mavsdk_poses, beat = told
     assert {(t.system, t.component) for t in told} == {(SYSTEM, 197)}
     assert (beat.fields["type"], beat.fields["autopilot"]) == (18, 8)
@@ -496,3 +510,23 @@ def test_mavsdk_and_the_stand_in_decode_the_same(tmp_path: Path) -> None:
     assert [line["fields"]["text"] for line in received(out, "STATUSTEXT")] == ["no map yet"]
     asked = {line["fields"]["param1"] for line in received(out, "COMMAND_LONG")}
     assert asked == {31.0, 32.0, 193.0}  # attitude, local position, estimator
+
+
+def test_mavsdk_reads_our_odometry_as_an_arducopter_takes_it(tmp_path: Path) -> None:
+    *odometries, _ = overheard_poses(tmp_path, "odometry")
+    assert len(odometries) == len(poses())
+    for told, (pose, covariance, at_ns, _) in zip(odometries, poses(), strict=True):
+        fields = told.fields
+        assert fields["time_usec"] == at_ns // 1000
+        # What it takes: LOCAL_FRD, of BODY_FRD; it drops all else.
+        assert (fields["frame_id"], fields["child_frame_id"]) == (20, 12)
+        np.testing.assert_allclose([fields[k] for k in "xyz"], pose.translation, rtol=1e-6)
+        rotation = matrix_from_quaternion(np.array(fields["q"]))
+        np.testing.assert_allclose(rotation, pose.rotation, atol=1e-6)
+        speed = np.array([fields[f"v{k}"] for k in "xyz"])
+        np.testing.assert_allclose(pose.rotation @ speed, VELOCITY, atol=1e-6)
+        said = np.array(fields["pose_covariance"])
+        expected = euler_pose_covariance(pose, covariance)
+        worst = np.linalg.eigvalsh(expected[:3, :3])[-1]
+        np.testing.assert_allclose(said[[0, 6, 11]].sum(), worst, rtol=1e-6)
+        np.testing.assert_allclose(said[[15, 18, 20]], np.diag(expected)[3:], rtol=1e-6)
