@@ -29,6 +29,37 @@ def _speed(_: click.Context, param: click.Parameter, value: str | None) -> float
     return speed
 
 
+_parameters = click.option(
+    "--parameter",
+    "parameters",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Of the real --autopilot, set before it starts (repeatable).",
+)
+_speed_option = click.option(
+    "--speed",
+    default="1",
+    show_default=True,
+    metavar="X|max",
+    callback=_speed,
+    help="Seconds of the flight per second, or max: as fast as all daemons keep up.",
+)
+_drones = click.option(
+    "--drones", default="", metavar="mav0,mav1", help="Only these fly; otherwise all of them."
+)
+_settings = click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="SECTION.KEY=VALUE",
+    help="More of the daemons' configuration, the value in TOML's notation (repeatable).",
+)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
 class _Commands(click.Group):
     """A group whose failures are one line: 2 for bad input, 1 for a flight that broke off."""
 
@@ -58,24 +89,9 @@ def main() -> None:
     metavar="ardupilot=FILE|px4=FOLDER",
     help="A real firmware built for simulation, in the stand-in's place.",
 )
-@click.option(
-    "--parameter",
-    "parameters",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="Of the real --autopilot, set before it starts (repeatable).",
-)
-@click.option(
-    "--speed",
-    default="1",
-    show_default=True,
-    metavar="X|max",
-    callback=_speed,
-    help="Seconds of the recording per second, or max: as fast as all daemons keep up.",
-)
-@click.option(
-    "--drones", default="", metavar="mav0,mav1", help="Only these fly; otherwise all of them."
-)
+@_parameters
+@_speed_option
+@_drones
 @click.option(
     "--known-distance",
     "distances",
@@ -102,13 +118,7 @@ def main() -> None:
     metavar="S",
     help="How long the daemons have to come up, and again to make the first map.",
 )
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar="SECTION.KEY=VALUE",
-    help="More of the daemons' configuration, the value in TOML's notation (repeatable).",
-)
+@_settings
 @click.option(
     "--pipeline",
     type=click.Choice(_PIPELINES),
@@ -209,7 +219,7 @@ def fly(
         speed=speed,
         attitude=attitude,
         known_distances=tuple(map(parse_known_distance, distances)),
-        drones=tuple(name.strip() for name in drones.split(",") if name.strip()),
+        drones=_names(drones),
         start_timeout_s=start_timeout,
         settings=(
             *map(parse_setting, settings),
@@ -249,24 +259,9 @@ def fly(
     required=True,
     help="A real firmware built for simulation: its own model flies.",
 )
-@click.option(
-    "--parameter",
-    "parameters",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="Of the --autopilot, set before it starts (repeatable).",
-)
-@click.option(
-    "--speed",
-    default="1",
-    show_default=True,
-    metavar="X|max",
-    callback=_speed,
-    help="Seconds of the flight per second but for rendering, or max: as fast as all keep up.",
-)
-@click.option(
-    "--drones", default="", metavar="mav0,mav1", help="Only these fly; otherwise all of them."
-)
+@_parameters
+@_speed_option
+@_drones
 @click.option(
     "--map",
     "map_of",
@@ -281,13 +276,7 @@ def fly(
     metavar="S",
     help="How long the daemons have to come up, and again to make the first map.",
 )
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar="SECTION.KEY=VALUE",
-    help="More of the daemons' configuration, the value in TOML's notation (repeatable).",
-)
+@_settings
 def live(
     scenario: str,
     out: Path,
@@ -315,7 +304,7 @@ def live(
 
     options = FlyOptions(
         speed=speed,
-        drones=tuple(name.strip() for name in drones.split(",") if name.strip()),
+        drones=_names(drones),
         start_timeout_s=start_timeout,
         settings=tuple(map(parse_setting, settings)),
         firmware=parse_firmware(autopilot, parameters),
