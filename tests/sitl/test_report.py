@@ -98,8 +98,15 @@ def test_numbers_are_those_of_the_logs(tmp_path: Path) -> None:
     assert drone["cpu_share"] == pytest.approx(0.5)
     assert drone["peer_bytes_per_s"] == pytest.approx(4400 / (11 * PERIOD_NS * 1e-9 + 0.003))
     assert drone["landmarks"] == 96.0
-    size = len(next((out / "run" / "mav0" / "maps").iterdir()).read_bytes())
-    assert report["map"] == {"revisions": 1, "landmarks": 200, "bytes": size, "keyframes": 1}
+    (kept,) = (out / "run" / "mav0" / "maps").iterdir()
+    size = len(kept.read_bytes())
+    assert report["map"] == {
+        "revision": kept.stem,
+        "revisions": 1,
+        "landmarks": 200,
+        "bytes": size,
+        "keyframes": 1,
+    }
 
 
 def test_the_report_says_what_was_sent_and_what_became_of_it(tmp_path: Path) -> None:
@@ -448,6 +455,7 @@ def test_the_page_of_a_flight_that_never_had_a_map(tmp_path: Path) -> None:
     page = page_of(result, out)
     assert ">0.0 %</b><span>of frames localized" in page
     assert report_of(result)["map"] == {
+        "revision": None,
         "revisions": 0,
         "landmarks": 0,
         "bytes": 0,
