@@ -133,6 +133,14 @@ def test_mutated_maps_are_a_map_with_exactly_these_bytes_or_a_wire_error(
     assert encode_map(decoded) == bytes(mutated)
 
 
+def test_a_landmark_that_lies_nowhere_is_a_wire_error() -> None:
+    """Its pixel with this byte is one that the lens shows nothing at."""
+    mutated = bytearray(encode_map(random_map(np.random.default_rng(33), 33, 1, 1.0)))
+    mutated[-471] = 0
+    with pytest.raises(WireError, match="a landmark lies nowhere"):
+        decode_map(bytes(mutated))
+
+
 @given(st.binary(max_size=300), st.booleans())
 def test_any_bytes_are_a_wire_error_or_a_map(body: bytes, with_header: bool) -> None:
     header = bytes([PROTOCOL_VERSION, BlobKind.MAP]) if with_header else b""

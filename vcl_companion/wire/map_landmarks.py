@@ -112,11 +112,13 @@ def landmarks_of_new(rows: Rows, views: Views) -> tuple[Array, Integers]:
     """Return points and pixels of such rows.
 
     Raises:
-        WireError: an observation lies outside of its image.
+        WireError: a landmark lies nowhere, or an observation outside of its image.
     """
     seen = rows.state == SEEN
     at = Places(rows.away > 0, rows.place, rows.first + rows.aside, rows.depth)
     points = views.points(at, seen)
+    if not np.isfinite(points).all():
+        raise WireError("map: a landmark lies nowhere")
     pixels = views.expected(points, seen) + rows.residual
     anchors, _ = views.anchors(seen)
     somewhere = np.flatnonzero(anchors < seen.shape[1])
