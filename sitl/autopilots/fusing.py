@@ -59,35 +59,37 @@ class Fusing:
         self.test_ratio = 0.0
         self.internal_error = ""
 
-    def take(self, pose: VisionPose) -> None:
-        """Take a pose in, or refuse it."""
+    def take(self, pose: VisionPose) -> bool:
+        """Take a pose in, or refuse it; return whether all that was believed gave way to it."""
         error_m = self._error_m(pose.upper)
         if error_m is None:
-            return
+            return False
         is_reset, self._resets = pose.reset_counter != self._resets, pose.reset_counter
         self._heard_ns = pose.at_ns
         if self._at_ns is None:
             away = np.zeros(3) if is_reset else pose.position
             self._begin(pose, error_m)
             self._position, self._velocity = pose.position - away, _STEP_PER_S * away
-            return
+            return True
         if is_reset:
             self._begin(pose, error_m)
-            return
+            return True
         self._predict(max(pose.at_ns - self._at_ns, 0) * 1e-9)
         self._at_ns = max(pose.at_ns, self._at_ns)
         innovation = pose.position - self._position
         variance = self._covariance[0, 0] + error_m**2
         self.test_ratio = float(innovation @ innovation) / (_GATE_SIGMAS**2 * 2.0 * variance)
         if self.test_ratio > 1.0:
-            if pose.at_ns - self._accepted_ns > _GIVES_IN_NS:
+            gives_in = pose.at_ns - self._accepted_ns > _GIVES_IN_NS
+            if gives_in:
                 self._begin(pose, error_m)
-            return
+            return gives_in
         self._accepted_ns = pose.at_ns
         gain = self._covariance[:, 0] / variance
         self._position = self._position + gain[0] * innovation
         self._velocity = self._velocity + gain[1] * innovation
         self._covariance -= np.outer(gain, self._covariance[0])
+        return False
 
     def flags(self, now_ns: int) -> int:
         """Return EKF_STATUS_FLAGS."""

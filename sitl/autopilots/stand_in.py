@@ -39,6 +39,7 @@ from sitl.autopilots.fusing import Fusing, VisionPose
 from sitl.autopilots.hearing import Hearing, datagrams
 from sitl.autopilots.speaking import Backlog, packed
 from sitl.autopilots.steered import open_udp, run_steered, serve
+from sitl.autopilots.vision_north import VisionNorth
 from vcl_companion.daemon.scheduling import run_before_others
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.rotation import Array, euler_from_matrix, matrix_from_quaternion
@@ -57,6 +58,7 @@ PARAMETERS = {
 }
 _HEARTBEAT_S = 1.0
 _TIMESYNC_PERIOD_NS = 100_000_000
+_YAW_SOURCE, _BY_VISION = "EK3_SRC1_YAW", 6.0
 _SET_GLOBAL_ORIGIN = 611  # not in pymavlink's dialects
 _ACCEPTED: int = dialect.MAV_RESULT_ACCEPTED
 _UNSUPPORTED: int = dialect.MAV_RESULT_UNSUPPORTED
@@ -134,10 +136,14 @@ class StandIn:
         self._now_ns: int | None = None
         self._companion: tuple[str, int] | None = None
         self._fusing = Fusing()
+        self._north = VisionNorth()
         self._interval_ns: dict[int, int] = {}
         self._backlog = Backlog()
         self._next_heartbeat_s = 0.0
         self._parameters = {**PARAMETERS, **options.parameters}
+        # What an earlier flight's autopilot said had its north already.
+        is_measured = isinstance(options.source, TruthAttitude)
+        self._has_no_north = is_measured and self._parameters[_YAW_SOURCE] == _BY_VISION
         # latitude and longitude, 1e-7 degrees, altitude, mm: as ArduPilot it keeps its first
         self._origin: tuple[int, int, int] | None = None
         self._streams = {
@@ -223,14 +229,7 @@ class StandIn:
                 )
             )
         elif kind == "VISION_POSITION_ESTIMATE":
-            self._fusing.take(
-                VisionPose(
-                    1000 * message.usec,
-                    np.array([message.x, message.y, message.z]),
-                    message.covariance,
-                    message.reset_counter,
-                )
-            )
+            self._fuse(message)
         elif (
             kind in ("COMMAND_LONG", "COMMAND_INT", "SET_GPS_GLOBAL_ORIGIN")
             and message.target_system == self._options.system_id
@@ -245,6 +244,14 @@ class StandIn:
                     message.get_srcComponent(),
                 )
             )  # fmt: skip
+
+    def _fuse(self, message: Any) -> None:
+        """Take a VISION_POSITION_ESTIMATE in."""
+        at_ns = 1000 * message.usec
+        position = np.array([message.x, message.y, message.z])
+        pose = VisionPose(at_ns, position, message.covariance, message.reset_counter)
+        if self._fusing.take(pose):
+            self._north.reset(at_ns, message.yaw)
 
     def _obey(self, message: Any) -> int:
         """Obey a COMMAND_LONG; return its MAV_RESULT."""
@@ -309,6 +316,8 @@ class StandIn:
         boot_ms = (at_ns - self._options.boot_offset_ns) // 1_000_000
         if not 0 <= boot_ms < 2**32:
             raise ConfigError(f"boot_offset_ns: {at_ns} is {boot_ms} ms after the start")
+        if self._has_no_north:
+            quaternion = self._north.of(at_ns, quaternion)
         # The wire has float32: what is kept is what was sent.
         sent = [float(value) for value in quaternion.astype(np.float32)]
         self._attitudes.write(f"{at_ns},{','.join(map(repr, sent))}\n")

@@ -131,8 +131,8 @@ def nobody_to_ask(work: MapWork, clock: ManualClock) -> InterTarget:
     alone = HostChoice(Group(SwarmOptions(), DRONE))
     return InterTarget(
         DRONE, alone, demo.sensor(DRONE), clock, work, lambda _, __: 0, lambda _: None,
-        lambda _: 0.1, lambda _, __: None, InterMavOptions(), np.random.default_rng(0),
-        only_the_surer=True,
+        lambda _, attitude: (attitude, True), lambda _: 0.1, lambda _, __: None,
+        InterMavOptions(), np.random.default_rng(0), only_the_surer=True,
     )  # fmt: skip
 
 

@@ -95,7 +95,8 @@ class Vehicle:
                 return self._says() if self._takes(seen.fields[:3]) else []
             case wire.PARAM_REQUEST_READ if self.height is not None:
                 name = seen.fields[3].rstrip(b"\0")
-                assert name == b"EKF2_HGT_REF"
+                if name != b"EKF2_HGT_REF":
+                    return []
                 raw = struct.pack("<i", self.height)
                 fields = (raw, 1, 0xFFFF, name, INT32)
                 return [wire.packed(wire.PARAM_VALUE, *fields, system=SYSTEM)]

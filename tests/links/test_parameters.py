@@ -35,7 +35,7 @@ def test_a_value_is_its_firmware_s_bytes(
 
 
 class Vehicle:
-    """Some parameters behind a UDP socket; every other question is lost."""
+    """Some parameters behind a UDP socket; every other question for each is lost."""
 
     def __init__(self, side: Udp, parameters: dict[str, tuple[bytes, int]]) -> None:
         self._side = side
@@ -49,7 +49,7 @@ class Vehicle:
                 if seen.message_id == wire.PARAM_REQUEST_READ:
                     name = seen.fields[3].rstrip(b"\0").decode()
                     self.asked.append(name)
-                    if len(self.asked) % 2 == 0:
+                    if self.asked.count(name) % 2 == 0:
                         self._tell(name, where)
                 elif seen.message_id == wire.PARAM_SET:
                     raw, _, _, name_bytes, kind = seen.fields
@@ -95,7 +95,6 @@ def test_what_the_autopilot_has_not_is_none() -> None:
             async with running(link.run(), vehicle.run()):
                 assert await link.parameter("NO_SUCH") is None
                 # The first may go before the link is up.
-                assert set(vehicle.asked) == {"NO_SUCH"}
-                assert 3 <= len(vehicle.asked) <= 4
+                assert 3 <= vehicle.asked.count("NO_SUCH") <= 4
 
     asyncio.run(scenario())

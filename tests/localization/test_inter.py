@@ -12,7 +12,7 @@ from tests.localization.maps import Descriptors, index_of_scene, seen_from
 from tests.mapping.views import descriptors_of
 from tests.scenes import facade_scene, perturbed
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import exp_so3, matrix_from_euler
+from vcl_companion.geometry.rotation import about_down, exp_so3, matrix_from_euler
 from vcl_companion.localization.inter import NoProposal, Proposal, localize_inter
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pair_evidence import InterOptions, Observer
@@ -147,6 +147,37 @@ def test_attitude_chooses_between_planar_twins(rng: np.random.Generator) -> None
     off = target.local(found.world_from_body)
     assert np.linalg.norm(off[3:]) < np.deg2rad(1.0)
     assert np.linalg.norm(off[:3]) < 0.3
+
+
+def test_without_a_common_north_only_roll_and_pitch_are_weighed(
+    rng: np.random.Generator, relief: Scene
+) -> None:
+    seen = [
+        seen_from(rng, relief[0].landmark_map, relief[1], pose, noise_px=0.3)
+        for pose in (HOST, TARGET)
+    ]
+    host, target = (observer(relief, seen[i], pose) for i, pose in enumerate((HOST, TARGET)))
+    assert target.ned_from_body is not None
+
+    def place(turn_deg: float, has_heading: bool) -> Proposal | NoProposal:
+        assert target.ned_from_body is not None
+        other_north = about_down(np.deg2rad(turn_deg)) @ target.ned_from_body
+        northless = replace(target, ned_from_body=other_north, has_heading=has_heading)
+        return localize_inter(host, HOST, SURE, northless, relief[0], OPTIONS)
+
+    known, alone = place(0.0, True), place(0.0, False)
+    assert isinstance(known, Proposal)
+    assert isinstance(alone, Proposal)
+    for turn_deg in (150.0, -60.0):
+        found = place(turn_deg, False)
+        assert isinstance(found, Proposal), found
+        assert_pose_close(
+            found.world_from_body, alone.world_from_body, within_m=1e-6, within_rad=1e-7
+        )
+        np.testing.assert_allclose(found.covariance, alone.covariance, rtol=1e-6)
+    assert_pose_close(alone.world_from_body, TARGET, within_m=0.1, within_rad=np.deg2rad(1.0))
+    # What the heading told makes it surer.
+    assert np.linalg.det(alone.covariance) >= np.linalg.det(known.covariance)
 
 
 def test_a_match_whose_word_nobody_checks_is_not_taken(rng: np.random.Generator) -> None:

@@ -10,7 +10,7 @@ import pytest
 from tests.checks import assert_pose_close, nees
 from tests.daemon import demo
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import exp_so3
+from vcl_companion.geometry.rotation import Array, about_down, exp_so3
 from vcl_companion.localization.intra import (
     LocalizationOptions,
     Localized,
@@ -117,6 +117,28 @@ def test_without_time_for_a_search_patches_are_followed_and_nothing_is_looked_fo
             found(fix, "patches")
         else:
             assert fix == NotLocalized("lost, and not looked for again yet")
+
+
+@pytest.mark.parametrize("expected", [None, prior()], ids=["lost", "predicted"])
+def test_an_autopilot_without_a_north_contradicts_no_heading(expected: Prior | None) -> None:
+    shot, sensor = demo.shot(DRONE, FRAME), demo.sensor(DRONE)
+    turned = about_down(2.0) @ shot.ned_from_body.rotation
+    tilted = turned @ exp_so3(np.deg2rad([20.0, 0.0, 0.0]))
+
+    def seen(ned_from_body: Array, has_heading: bool) -> Localized | NotLocalized:
+        return localize(
+            shot.image, sensor.camera, sensor.body_from_cam, demo.map_index(1, 2, 3),
+            demo.templates(1, 2, 3), expected, ned_from_body, OPTIONS,
+            Effort(has_heading=has_heading),
+        )  # fmt: skip
+
+    found(seen(turned, False), "patches")
+    refused = seen(turned, True)
+    assert isinstance(refused, NotLocalized)
+    assert "heading" in refused.reason
+    refused = seen(tilted, False)
+    assert isinstance(refused, NotLocalized)
+    assert "roll and pitch" in refused.reason
 
 
 def test_the_paper_s_pipeline_finds_features_only() -> None:

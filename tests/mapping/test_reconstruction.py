@@ -20,12 +20,12 @@ from tests.scenes import (
 )
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, exp_so3
+from vcl_companion.geometry.rotation import Array, about_down, exp_so3
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.reconstruction import MapOptions, NoMap, reconstruct
 from vcl_companion.mapping.uncertainty import SHARED_NOISE_PX, map_uncertainty
-from vcl_companion.mapping.visibility import choose_hypothesis
+from vcl_companion.mapping.visibility import RelativeAttitude, choose_hypothesis
 from vcl_companion.vision.essential import RelativePose
 from vcl_companion.vision.features import Features
 
@@ -349,6 +349,37 @@ def test_planar_twins_without_attitude_are_refused(baseline_m: float) -> None:
     assert "a flat scene" in reason
 
 
+def test_drones_that_know_no_north_make_the_leader_s_map() -> None:
+    """Each says 0 however it stands; what they see says how they stand to each other."""
+    rng = np.random.default_rng(6)
+    scene = facade_scene(rng, n_views=3, noise_px=0.3)
+    views = drone_views(rng, scene, [1, 2, 3], attitude_sigma_rad=0.005)
+    turned = []
+    for view, turn_deg in zip(views, (0.0, 150.0, -40.0), strict=True):
+        assert view.ned_from_body is not None
+        attitude = about_down(np.deg2rad(turn_deg)) @ view.ned_from_body
+        turned.append(replace(view, ned_from_body=attitude))
+    known = [(1, 2, scene.baseline_m(0, 1))]
+    northless = [turned[0], *(replace(view, has_heading=False) for view in turned[1:])]
+    made, as_known = (reconstruct(some, 1, known, OPTIONS) for some in (northless, views))
+    assert isinstance(made, LandmarkMap)
+    assert isinstance(as_known, LandmarkMap)
+    assert len(made.keyframes) == len(as_known.keyframes) == 3
+    for one, other in zip(made.keyframes, as_known.keyframes, strict=True):
+        assert_pose_close(
+            one.world_from_body, other.world_from_body, within_m=0.02, within_rad=1e-3
+        )
+
+
+def test_a_pose_that_only_tilts_wrongly_is_told_by_the_vertical() -> None:
+    """Between twins that differ in the vertical, no north is needed to choose."""
+    tilted = exp_so3(np.deg2rad([20.0, 0.0, 0.0]))
+    level = RelativeAttitude(about_down(2.0), np.eye(3), has_heading=False)
+    assert level.b_from_a is None
+    assert level.off_rad(about_down(-1.0)) == pytest.approx(0.0, abs=1e-9)
+    assert level.off_rad(about_down(0.7) @ tilted) == pytest.approx(np.deg2rad(20.0), abs=1e-9)
+
+
 def hypothesis(rotation_deg: float, shift_deg: float, cost: float) -> RelativePose:
     shift = np.deg2rad(shift_deg)
     pose = Pose(
@@ -361,13 +392,15 @@ def hypothesis(rotation_deg: float, shift_deg: float, cost: float) -> RelativePo
 def test_the_choice_weighs_cost_and_attitude() -> None:
     right, twin = hypothesis(0.0, 0.0, 55.0), hypothesis(20.0, 50.0, 50.0)
     sigma = np.deg2rad(4.0)
-    assert choose_hypothesis([twin, right], np.eye(3), sigma) is right
-    assert choose_hypothesis([twin, right], exp_so3(np.deg2rad([0.0, 20.0, 0.0])), sigma) is twin
+    alike = RelativeAttitude(np.eye(3), np.eye(3))
+    turned = RelativeAttitude(exp_so3(np.deg2rad([0.0, 20.0, 0.0])), np.eye(3))
+    assert choose_hypothesis([twin, right], alike, sigma) is right
+    assert choose_hypothesis([twin, right], turned, sigma) is twin
     assert isinstance(choose_hypothesis([twin, right], None, sigma), NoMap)
     clearly = hypothesis(20.0, 50.0, 20.0)
     assert choose_hypothesis([clearly, right], None, sigma) is clearly
     # Ten sigma of the attitudes outweigh any small advantage of cost.
-    assert choose_hypothesis([hypothesis(40.0, 50.0, 20.0), right], np.eye(3), sigma) is right
+    assert choose_hypothesis([hypothesis(40.0, 50.0, 20.0), right], alike, sigma) is right
 
 
 def test_hypotheses_that_hardly_differ_are_no_reason_to_refuse() -> None:

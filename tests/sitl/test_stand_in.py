@@ -23,7 +23,10 @@ from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.pose import Pose, euler_pose_covariance
 from vcl_companion.geometry.rotation import (
     Array,
+    about_down,
+    euler_from_matrix,
     exp_so3,
+    heading_of,
     log_so3,
     matrix_from_euler,
     matrix_from_quaternion,
@@ -192,6 +195,44 @@ def test_our_link_finds_the_attitude_of_every_frame(tmp_path: Path) -> None:
     for k in range(2):
         again = attitudes_of(frames_at_ns, tmp_path / f"again{k}", replay)
         np.testing.assert_array_equal(again, found)
+
+
+def test_it_knows_no_north_until_it_is_told_poses(tmp_path: Path) -> None:
+    out = tmp_path / "mav"
+    clock = ManualClock(START_NS)
+    frames_at_ns = [START_NS + k * 100 * MS for k in range(1, 20)]
+    told = Pose(about_down(1.2) @ true_at(frames_at_ns[9]), np.array([1.0, 2.0, -3.0]))
+
+    async def scenario() -> None:
+        exact = truth(tmp_path, tilt_bias_deg=0, heading_bias_deg=0, white_deg=0)
+        async with stand_in(out, exact) as process:
+            await process.advance_to(START_NS + 50 * MS)
+            link = link_to(process.port, clock)
+            async with running(link.run()):
+                for at_ns in frames_at_ns:
+                    await process.advance_to(at_ns)
+                    clock.advance_to(at_ns)
+                    await link.attitude_at(at_ns, LONGEST_S)
+                    assert not link.has_heading
+                    if at_ns == frames_at_ns[9]:
+                        estimate = PoseEstimate(
+                            told, np.eye(6) * 1e-4, np.zeros(3), np.eye(3), at_ns, 1
+                        )
+                        assert link.send_pose(estimate) is None
+                        await until(lambda: bool(received(out, "VISION_POSITION_ESTIMATE")))
+                await process.finish()
+
+    asyncio.run(scenario())
+    times, quaternions = attitude_rows(out)
+    north_rad = [
+        heading_of(matrix_from_quaternion(quaternion) @ true_at(at_ns).T)
+        for at_ns, quaternion in zip(times, quaternions, strict=True)
+    ]
+    first = -euler_from_matrix(true_at(times[0]))[2]
+    before = [r for at_ns, r in zip(times, north_rad, strict=True) if at_ns <= frames_at_ns[9]]
+    after = north_rad[len(before) :]
+    np.testing.assert_allclose(before, first, atol=1e-5)
+    np.testing.assert_allclose(after, 1.2, atol=1e-3)
 
 
 def test_its_errors_are_what_it_states(tmp_path: Path) -> None:

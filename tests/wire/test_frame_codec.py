@@ -29,11 +29,19 @@ def _frames(draw: st.DrawFn) -> FrameAnswer:
         camera=draw(st.sampled_from(CAMERAS)),
         image_bytes=draw(st.binary(min_size=1, max_size=400)),
         world_from_body=random_pose(rng, 30.0) if draw(st.booleans()) else None,
+        has_heading=draw(st.booleans()),
     )
 
 
 def assert_frames_close(a: FrameAnswer, b: FrameAnswer) -> None:
-    for name in ("drone_id", "request_id", "captured_at_ns", "frame_age_s", "camera"):
+    for name in (
+        "drone_id",
+        "request_id",
+        "captured_at_ns",
+        "frame_age_s",
+        "camera",
+        "has_heading",
+    ):
         assert getattr(a, name) == getattr(b, name)
     assert a.image_bytes == b.image_bytes
     assert np.array_equal(a.body_from_cam.translation, b.body_from_cam.translation)
@@ -57,6 +65,9 @@ def test_golden_bytes() -> None:
     here = replace(small_frame(), world_from_body=small_frame().body_from_cam)
     assert_golden("frame_answer_with_pose", encode_frame(here))
     assert_frames_close(decode_frame(encode_frame(here)), here)
+    northless = replace(small_frame(), has_heading=False)
+    assert_golden("frame_answer_no_heading", encode_frame(northless))
+    assert_frames_close(decode_frame(encode_frame(northless)), northless)
 
 
 def test_a_frame_passed_on_is_the_same_but_for_its_kind() -> None:

@@ -129,6 +129,7 @@ async def _run(config: Config) -> int:
         lambda why: log.event("jump", why),
         keeps_local=config.swarm.keeps_local,
         heading=config.autopilot.heading,
+        has_heading=lambda: autopilot.has_heading,
     )
     autopilot.origin.origin_world = lambda: origin_in_leaders_world(
         estimator.local, group, maps.current

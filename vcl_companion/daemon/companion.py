@@ -7,7 +7,7 @@ import logging
 import math
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -230,7 +230,9 @@ class Companion:
         now_s = asyncio.get_running_loop().time()
         follows = stored.templates is not None
         may_doubt = now_s >= self._doubted_at_s + _DOUBT_EVERY_S
-        effort = Effort(may_search=not follows, may_doubt=may_doubt)
+        effort = Effort(
+            may_search=not follows, may_doubt=may_doubt, has_heading=self._estimator.has_heading
+        )
         fix = await self._looked_at(frame, stored, ned_from_body, effort)
         if isinstance(fix, Localized) and is_doubtful(fix):
             self._doubted_at_s = now_s
@@ -301,7 +303,11 @@ class Companion:
         A map that was made because the last one ended here comes while that is searched in vain.
         """
         frame, stored = sought.frame, sought.stored
-        effort = Effort(may_track=False, may_fall_back=sought.may_fall_back)
+        effort = Effort(
+            may_track=False,
+            may_fall_back=sought.may_fall_back,
+            has_heading=self._estimator.has_heading,
+        )
         while True:
             began_s = asyncio.get_running_loop().time()
             predicted = self._estimator.predicted(frame.captured_at_ns, sought.ned_from_body)
@@ -323,7 +329,8 @@ class Companion:
         stored = self._maps.current
         if stored is not None and stored.templates is not None:
             ned_from_body = await self._attitude_of(frame)
-            fix = await self._looked_at(frame, stored, ned_from_body, _PATCHES_ALONE)
+            effort = replace(_PATCHES_ALONE, has_heading=self._estimator.has_heading)
+            fix = await self._looked_at(frame, stored, ned_from_body, effort)
             if self._take(frame, fix, ned_from_body) is None:
                 self._outcomes.close(frame)
                 return

@@ -11,7 +11,7 @@ import numpy as np
 
 from vcl_companion.daemon.local_frame import LocalFrame
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.rotation import Array, quaternion_from_matrix
 from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.links.autopilot_options import Heading
 from vcl_companion.localization.intra import (
@@ -26,6 +26,7 @@ from vcl_companion.localization.pose_filter import (
     FilterState,
     NotFused,
     carried,
+    north_aligned,
     predict,
     started,
     started_from_proposal,
@@ -54,6 +55,8 @@ class Estimator:
         keeps_local: whether the autopilot goes on being told poses in the frame that it knows
             when our map's world is left; else it is told the other world's, a jump.
         heading: whose north that frame has (``LocalFrame``).
+        has_heading: whether the autopilot's heading is its own, so by the map's north but for a
+            few degrees; else only how it changes counts.
     """
 
     def __init__(
@@ -64,7 +67,9 @@ class Estimator:
         *,
         keeps_local: bool = True,
         heading: Heading = "map",
+        has_heading: Callable[[], bool] = lambda: True,
     ) -> None:
+        self._has_heading = has_heading
         self._keeps_local = keeps_local
         self._options = options
         self._localization = localization
@@ -86,6 +91,28 @@ class Estimator:
         """Revision of the map that the last frame was looked at on."""
         self.novelty_deg = 0.0
         """How differently they looked there from how they are remembered, degrees."""
+
+    @property
+    def has_heading(self) -> bool:
+        """Whether the autopilot's heading is by the map's north but for a few degrees."""
+        return self._has_heading()
+
+    def for_peers(self, at_ns: int, ned_from_body: Array | None) -> tuple[Array | None, bool]:
+        """Return an attitude as peers are told it: by the map's north, as far as we know that.
+
+        Args:
+            at_ns: its instant.
+            ned_from_body: (3, 3) as the autopilot says, or None.
+
+        Returns:
+            (4,) unit quaternion or None, and whether its heading tells peers anything.
+        """
+        if ned_from_body is None:
+            return None, True
+        state = self._history.at(at_ns) or self._history.newest
+        if state is None or state.ned_from_body is None:
+            return quaternion_from_matrix(ned_from_body), self.has_heading
+        return quaternion_from_matrix(north_aligned(state) @ ned_from_body), True
 
     def is_localized(self, now_ns: int) -> bool:
         """Whether a frame of the last two seconds gave a pose, by a fix or by a proposal."""
@@ -270,7 +297,9 @@ class Estimator:
             The state of that instant with the proposal in it, or why it was not taken.
         """
         if ned_from_body is not None:
-            reason = disagreement(world_from_body.rotation, ned_from_body, self._localization)
+            options = self._localization
+            options = options if self.has_heading else options.of_any_heading()
+            reason = disagreement(world_from_body.rotation, ned_from_body, options)
             if reason:
                 return NotFused(reason, contradicts=True)
         too_far = self._too_far(at_ns, world_from_body, covariance)

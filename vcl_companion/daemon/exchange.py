@@ -201,6 +201,7 @@ class Exchange:
             work,
             partial(self._hand, BlobKind.POSE_REQUEST),
             transfers.cancel,
+            estimator.for_peers,
             transfers.carried_in_s,
             self.trust.judged,
             options.inter,

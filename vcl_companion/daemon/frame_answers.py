@@ -17,7 +17,6 @@ from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.mailbox import PeerMailbox
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.peer_clocks import PeerClocks
-from vcl_companion.geometry.rotation import quaternion_from_matrix
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.peer_time import Instant
@@ -168,6 +167,9 @@ class FrameAnswers:
         if self._estimator.is_localized(self._clock.now_ns()):
             await self._estimator.looked_at(at_ns, _SETTLE_S)
         state = self._estimator.own_fix_at(at_ns)
+        ned_from_body, has_heading = self._estimator.for_peers(
+            at_ns, None if attitude is None else attitude.ned_from_body
+        )
         image_bytes = await self._work.encode_keyframe(
             np.asarray(frame.image), self._image_bytes, extends=state is not None
         )
@@ -176,11 +178,10 @@ class FrameAnswers:
             request_id=request_id,
             captured_at_ns=frame.captured_at_ns,
             frame_age_s=max(self._clock.now_ns() - frame.captured_at_ns, 0) * 1e-9,
-            ned_from_body=None
-            if attitude is None
-            else quaternion_from_matrix(attitude.ned_from_body),
+            ned_from_body=ned_from_body,
             body_from_cam=self._sensor.body_from_cam,
             camera=self._sensor.camera,
             image_bytes=image_bytes,
             world_from_body=None if state is None else state.world_from_body,
+            has_heading=has_heading,
         )

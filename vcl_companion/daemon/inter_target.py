@@ -16,7 +16,7 @@ from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
 from vcl_companion.daemon.estimator import HISTORY_S
 from vcl_companion.daemon.map_work import MapWork
-from vcl_companion.geometry.rotation import Array, quaternion_from_matrix
+from vcl_companion.geometry.rotation import Array
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
 from vcl_companion.wire.frame_codec import FrameAnswer
@@ -81,6 +81,7 @@ class InterTarget:
         cancel: ends a transfer, one that is over already too.
         judged: told of every proposal whether it fits what we know ourselves: the peer, and
             how it does not.
+        for_peers: how an attitude of an instant is told to peers (``Estimator.for_peers``).
         carried_in_s: how long our link takes to carry so many bytes to one peer.
         options: how often, how many, how long.
         rng: numbers the requests.
@@ -97,6 +98,7 @@ class InterTarget:
         work: MapWork,
         hand: Callable[[int, bytes], int],
         cancel: Callable[[int], None],
+        for_peers: Callable[[int, Array | None], tuple[Array | None, bool]],
         carried_in_s: Callable[[int], float],
         judged: Callable[[int, str], None],
         options: InterMavOptions,
@@ -111,6 +113,7 @@ class InterTarget:
         self._only_the_surer = only_the_surer
         self._hand = hand
         self._cancel = cancel
+        self._for_peers = for_peers
         self._carried_in_s = carried_in_s
         self.judged = judged
         self._options = options
@@ -257,16 +260,17 @@ class InterTarget:
             self._options.request_quality,
             self._options.request_bytes,
         )
-        attitude = asked.ned_from_body
+        attitude, has_heading = self._for_peers(asked.frame.captured_at_ns, asked.ned_from_body)
         frame = FrameAnswer(
             drone_id=self._system_id,
             request_id=asked.request_id,
             captured_at_ns=asked.frame.captured_at_ns,
             frame_age_s=max(self._clock.now_ns() - asked.frame.captured_at_ns, 0) * 1e-9,
-            ned_from_body=None if attitude is None else quaternion_from_matrix(attitude),
+            ned_from_body=attitude,
             body_from_cam=self._sensor.body_from_cam,
             camera=self._sensor.camera,
             image_bytes=image_bytes,
+            has_heading=has_heading,
         )
         return encode_pose_request(PoseRequest(asked.revision, frame))
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, exp_so3
+from vcl_companion.geometry.rotation import Array, about_down, heading_of
 from vcl_companion.links.autopilot_options import Heading
 from vcl_companion.localization.pose_filter import FilterState
 from vcl_companion.swarm.group import Group
@@ -45,14 +45,8 @@ class LocalFrame:
     def settles(self, state: FilterState) -> bool:
         """Whether poses can be told: with the autopilot's own north not before it has told it."""
         if not self.is_settled and state.ned_from_body is not None:
-            ned_from_world = state.world_from_ned.T
-            # The turn about the vertical that is nearest to it: tilt errors have no part in it.
-            north_rad = math.atan2(
-                ned_from_world[1, 0] - ned_from_world[0, 1],
-                ned_from_world[0, 0] + ned_from_world[1, 1],
-            )
-            turn = exp_so3(np.array([0.0, 0.0, north_rad]))
-            self.from_world = Pose(turn, np.zeros(3))
+            north_rad = heading_of(state.world_from_ned.T)
+            self.from_world = Pose(about_down(north_rad), np.zeros(3))
             self.is_settled = True
             _log.info(
                 "the map's north is at %.1f degrees by the autopilot", math.degrees(north_rad)

@@ -146,4 +146,5 @@ def _seen(frame: FrameAnswer, features: tuple[Features, ...]) -> DroneView:
         frame.image_bytes,
         features,
         frame.world_from_body,
+        frame.has_heading,
     )

@@ -13,7 +13,7 @@ from vcl_companion.geometry.rotation import matrix_from_quaternion
 from vcl_companion.localization.inter import NoProposal, Proposal, localize_inter
 from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.localization.pair_evidence import Observer
-from vcl_companion.localization.pose_filter import FilterState
+from vcl_companion.localization.pose_filter import FilterState, north_aligned
 from vcl_companion.mapping.drone_view import decode_image
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.pose_requests import InterMavOptions
@@ -84,11 +84,14 @@ class PeerLook:
         image: Image,
     ) -> Proposal | NoProposal:
         """Propose it by one detector."""
+        attitude = state.ned_from_body
+        if attitude is not None:
+            attitude = north_aligned(state) @ attitude
         host = Observer(
             self._own_features(frame, index.detector),
             self._sensor.camera,
             self._sensor.body_from_cam,
-            state.ned_from_body,
+            attitude,
         )
         attitude = seen.ned_from_body
         target = Observer(
@@ -96,6 +99,7 @@ class PeerLook:
             seen.camera,
             seen.body_from_cam,
             None if attitude is None else matrix_from_quaternion(attitude),
+            seen.has_heading,
         )
         pose, covariance = state.world_from_body, state.pose_covariance()
         return localize_inter(host, pose, covariance, target, index, self._options)

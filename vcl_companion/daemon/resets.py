@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, euler_from_matrix, exp_so3
+from vcl_companion.geometry.rotation import Array, about_down, euler_from_matrix
 from vcl_companion.links.vehicle_mode import VehicleMode
 
 ResetMode = Literal["follow", "blend", "wait"]
@@ -132,7 +132,7 @@ class Resets:
         length_m = float(np.linalg.norm(off))
         left_m = _towards_zero(length_m, self._speed_m_s * since_s)
         slid = off * (left_m / length_m) if length_m > 0.0 else off
-        rotation = _about_down(turn_rad)
+        rotation = about_down(turn_rad)
         self._shift = Pose(rotation, pose.translation + slid - rotation @ pose.translation)
         self._shifted_at_ns = max(at_ns, self._shifted_at_ns)
         speed = (slid - off) / since_s if since_s > 0.0 else np.zeros(3)
@@ -185,7 +185,7 @@ def _explains(pose: Pose, covariance: Array, expected: Pose) -> bool:
 def _shift_between(told: Pose, pose: Pose) -> Pose:
     """Return what carries a pose to where another is, its roll and pitch as they are."""
     turn_rad = _heading(told.rotation) - _heading(pose.rotation)
-    rotation = _about_down(math.remainder(turn_rad, math.tau))
+    rotation = about_down(math.remainder(turn_rad, math.tau))
     return Pose(rotation, told.translation - rotation @ pose.translation)
 
 
@@ -199,7 +199,3 @@ def _towards_zero(value: float, step: float) -> float:
 
 def _heading(rotation: Array) -> float:
     return euler_from_matrix(rotation)[2]
-
-
-def _about_down(angle_rad: float) -> Array:
-    return np.asarray(exp_so3(np.array([0.0, 0.0, angle_rad])))

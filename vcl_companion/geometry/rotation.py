@@ -53,6 +53,21 @@ def right_jacobian_so3(rotation_vector: Array) -> Array:
     )
 
 
+def about_down(angle_rad: float) -> Array:
+    """Return the (3, 3) turn about the down axis of north-east-down."""
+    return exp_so3(np.array([0.0, 0.0, angle_rad]))
+
+
+def heading_of(rotation: Array) -> float:
+    """Return the turn about the down axis that is nearest to a (3, 3) rotation, rad.
+
+    Of a rotation between two north-east-downs it is the turn of the heading; what their verticals
+    are off each other has no part in it.
+    """
+    sine, cosine = rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1]
+    return float(np.arctan2(sine, cosine))
+
+
 def orthonormalized(matrix: Array) -> Array:
     """Return the rotation nearest to a (3, 3) matrix that drifted from orthonormality."""
     u, _, vt = np.linalg.svd(matrix)

@@ -18,7 +18,7 @@ from typing import Literal
 
 import numpy as np
 
-from vcl_companion.geometry.rotation import Array, exp_so3, log_so3
+from vcl_companion.geometry.rotation import Array, about_down, exp_so3, log_so3
 from vcl_companion.links.messages import AttitudeSample
 
 _NS_PER_MS = 1_000_000
@@ -109,7 +109,7 @@ class AttitudeHistory:
         if step_rad:
             taken = "turned"
             self._north_rad += step_rad
-            turned_back = _about_down(-step_rad) @ sample.ned_from_body
+            turned_back = about_down(-step_rad) @ sample.ned_from_body
             sample = replace(sample, ned_from_body=turned_back)
         self._samples.append(sample)
         self._arrivals.append(arrived_at_ns - self._measured_ns(sample))
@@ -191,7 +191,7 @@ class AttitudeHistory:
     def _in_first_north(self, sample: AttitudeSample) -> AttitudeSample:
         if self._north_rad == 0.0:
             return sample
-        return replace(sample, ned_from_body=_about_down(-self._north_rad) @ sample.ned_from_body)
+        return replace(sample, ned_from_body=about_down(-self._north_rad) @ sample.ned_from_body)
 
     def _turned_by(self, sample: AttitudeSample) -> float:
         """Return by how much the autopilot turned its north before a sample, rad; 0 if not."""
@@ -220,10 +220,6 @@ class AttitudeHistory:
 def _heading_change(before: AttitudeSample, after: AttitudeSample) -> float:
     """Return by how much a body turned about the vertical from one sample to another, rad."""
     return float(log_so3(after.ned_from_body @ before.ned_from_body.T)[2])
-
-
-def _about_down(angle_rad: float) -> Array:
-    return np.asarray(exp_so3(np.array([0.0, 0.0, angle_rad])))
 
 
 def _on_arc(before: AttitudeSample, after: AttitudeSample, fraction: float) -> Array:

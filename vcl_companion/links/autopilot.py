@@ -18,6 +18,7 @@ from vcl_companion.links.attitude import Attitude, AttitudeHistory
 from vcl_companion.links.autopilot_options import AutopilotOptions, ServiceState
 from vcl_companion.links.counters import LinkCounters, LinkTally
 from vcl_companion.links.fusion import Fusion, FusionMonitor
+from vcl_companion.links.heading_source import HeadingSource
 from vcl_companion.links.mavlink import Codec
 from vcl_companion.links.messages import (
     ATTITUDE_QUATERNION_ID,
@@ -113,7 +114,10 @@ class AutopilotLink:
             self.announce,
         )
         """Sets the origin of the autopilot's local frame."""
+        self._heading = HeadingSource(self.parameter)
         self._firmware = _FIRMWARE.get(options.profile, Firmware.OTHER)
+        if options.profile != "auto":
+            self._heading.is_of(self._firmware)
         for told in (self._streams, self._fusion, self.origin):
             told.firmware = self._firmware
         self._first_reset: int | None = None
@@ -161,11 +165,17 @@ class AutopilotLink:
             group.create_task(self._questions())
             group.create_task(self._streams.run())
             group.create_task(self.origin.run())
+            group.create_task(self._heading.run())
 
     @property
     def firmware(self) -> Firmware:
         """Whose software the autopilot runs, as far as is known."""
         return self._firmware
+
+    @property
+    def has_heading(self) -> bool:
+        """Whether the heading of its attitudes is its own, a compass's, and not what we tell it."""
+        return self._heading.is_own
 
     @property
     def attitude_rate_hz(self) -> float:
@@ -438,6 +448,7 @@ class AutopilotLink:
             self._fusion.believes(measured_ns, message.position, message.velocity)
 
     def _is_of(self, firmware: Firmware) -> None:
+        self._heading.is_of(firmware)
         if firmware is not self._firmware:
             self._firmware = firmware
             _log.info("the autopilot's firmware: %s", firmware.value)
@@ -462,6 +473,7 @@ class AutopilotLink:
                 self._fusion = FusionMonitor()
                 self._streams.ask_for_all()
                 self.origin.forget()
+                self._heading.forget()
                 (self._by_euler if quaternion else self._by_quaternion).clear()
         self._wake()
 

@@ -161,6 +161,8 @@ def _rotation_guess(host: Observer, target: Observer) -> Array | None:
     """Return camera target_from_host (3, 3) by the two autopilots."""
     if host.ned_from_body is None or target.ned_from_body is None:
         return None
+    if not (host.has_heading and target.has_heading):
+        return None
     ned_from_target = target.ned_from_body @ target.body_from_cam.rotation
     return np.asarray(ned_from_target.T @ host.ned_from_body @ host.body_from_cam.rotation)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -82,6 +82,10 @@ class LocalizationOptions:
         ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
+    def of_any_heading(self) -> LocalizationOptions:
+        """Return the same where the autopilot's heading says nothing of the map's north."""
+        return replace(self, max_heading_deg=180.0)
 
 
 @dataclass(frozen=True, eq=False)

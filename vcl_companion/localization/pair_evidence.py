@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, log_so3
+from vcl_companion.geometry.rotation import Array, about_down, heading_of, log_so3
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.vision.bundle import linearized
 from vcl_companion.vision.essential import sampson_px
@@ -80,12 +80,14 @@ class Observer:
         camera: its intrinsics.
         body_from_cam: its mounting.
         ned_from_body: (3, 3) attitude by its autopilot, or None.
+        has_heading: whether its heading is by the other's north; else only roll and pitch count.
     """
 
     features: Features
     camera: Camera
     body_from_cam: Pose
     ned_from_body: Array | None
+    has_heading: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +242,11 @@ class PairEvidence:
             return None
         tilt, heading = np.deg2rad([self.options.tilt_sigma_deg, self.options.attitude_sigma_deg])
         in_world = np.diag(1.0 / np.array([tilt, tilt, heading]) ** 2)
-        off = log_so3(self.expected_rotation.T @ pose.rotation)
+        expected = self.expected_rotation
+        if not (self.host.has_heading and self.target.has_heading):
+            in_world[2, 2] = 0.0
+            expected = about_down(heading_of(pose.rotation @ expected.T)) @ expected
+        off = log_so3(expected.T @ pose.rotation)
         return off, np.asarray(pose.rotation.T @ in_world @ pose.rotation)
 
     def _sigma_px(self, pose: Pose) -> Array:

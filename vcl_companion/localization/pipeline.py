@@ -10,7 +10,7 @@ uncertain to be believed may still lead, if then most patches are where they sho
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from vcl_companion.geometry.camera import Camera
@@ -56,12 +56,15 @@ class Effort:
         may_search: whether features are looked for when patches alone give no pose.
         may_doubt: whether features are asked about a pose that few patches agree on.
         may_fall_back: whether a second detector is asked when the first one fails.
+        has_heading: whether the attitude's heading is the autopilot's own, so by the map's north
+            but for a few degrees; else a pose may have any.
     """
 
     may_track: bool = True
     may_search: bool = True
     may_doubt: bool = True
     may_fall_back: bool = True
+    has_heading: bool = True
 
 
 ALL_EFFORT = Effort()
@@ -99,6 +102,8 @@ def localize(
         The pose with its covariance in parts, or why there is none: what the
         features said, for they were asked last.
     """
+    if not effort.has_heading:
+        options = replace(options, localization=options.localization.of_any_heading())
     tracked: Localized | NotLocalized | None = None
     if templates is not None and prior is not None and effort.may_track:
         tracked = track(

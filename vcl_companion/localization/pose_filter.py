@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, exp_so3, log_so3
+from vcl_companion.geometry.rotation import Array, about_down, exp_so3, heading_of, log_so3
 from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.localization.covariance_intersection import intersect, unlikeness
 from vcl_companion.localization.intra import Localized, NotLocalized, Prior
@@ -197,6 +197,11 @@ def carried(state: FilterState, other_from_world: Similarity) -> FilterState:
         covariance=moving @ state.covariance @ moving.T,
         own_map_covariance=stretching @ state.own_map_covariance @ stretching,
     )
+
+
+def north_aligned(state: FilterState) -> Array:
+    """Return the (3, 3) turn about the vertical from the autopilot's north to the world's."""
+    return about_down(heading_of(state.world_from_ned))
 
 
 def predict(

@@ -49,7 +49,7 @@ class Correspondences:
         places = []
         for k, keyframe in enumerate(keyframes):
             place = float(len(keyframes) - k) + (keyframe.drone_id != view.drone_id)
-            if view.ned_from_body is not None:
+            if view.ned_from_body is not None and view.has_heading:
                 axis = (view.ned_from_body @ view.body_from_cam.rotation)[:, 2]
                 then = (keyframe.world_from_body.rotation @ keyframe.body_from_cam.rotation)[:, 2]
                 angle_deg = np.rad2deg(np.arccos(np.clip(axis @ then, -1.0, 1.0)))

@@ -27,6 +27,8 @@ class DroneView:
         image_bytes: the encoded image, as exchanged.
         features: found in that image, one set for each detector the builder uses.
         world_from_body: where the drone's own localization on the map puts it, or None.
+        has_heading: whether the attitude's heading is by the north of the others; else only its
+            roll and pitch count.
     """
 
     drone_id: int
@@ -37,6 +39,7 @@ class DroneView:
     image_bytes: bytes
     features: tuple[Features, ...]
     world_from_body: Pose | None = None
+    has_heading: bool = True
 
     @property
     def pixels(self) -> Array:

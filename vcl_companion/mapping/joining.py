@@ -129,7 +129,9 @@ def contradiction(view: DroneView, world_from_body: Pose, options: MapOptions) -
     if view.ned_from_body is None:
         return ""
     sigma = np.deg2rad(options.attitude_sigma_deg)
-    turn = float(np.linalg.norm(log_so3(world_from_body.rotation.T @ view.ned_from_body)))
+    turn = 0.0
+    if view.has_heading:
+        turn = float(np.linalg.norm(log_so3(world_from_body.rotation.T @ view.ned_from_body)))
     vertical = float(world_from_body.rotation[2] @ view.ned_from_body[2])
     tilt = float(np.arccos(np.clip(vertical, -1.0, 1.0)))
     if tilt > 3.0 * sigma or turn > 3.0 * _HEADING_FACTOR * sigma:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, log_so3
+from vcl_companion.geometry.rotation import Array, about_down, heading_of, log_so3
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.tracks import PairMatches
@@ -50,15 +50,53 @@ def visibility_graph(
     return {(i, k): _edge(drones[i], drones[k], m, options, seed) for (i, k), m in matched.items()}
 
 
+@dataclass(frozen=True, eq=False)
+class RelativeAttitude:
+    """How two cameras are turned to each other by their autopilots.
+
+    Attributes:
+        ned_from_a: (3, 3) of the one camera.
+        ned_from_b: (3, 3) of the other.
+        has_heading: whether both are by one north; else only by one vertical.
+    """
+
+    ned_from_a: Array
+    ned_from_b: Array
+    has_heading: bool = True
+
+    @property
+    def b_from_a(self) -> Array | None:
+        """(3, 3) the rotation; None without a heading."""
+        return self.ned_from_b.T @ self.ned_from_a if self.has_heading else None
+
+    def off_rad(self, b_from_a: Array) -> float:
+        """Return by how much a (3, 3) rotation contradicts them."""
+        off = self.ned_from_b @ b_from_a @ self.ned_from_a.T
+        if not self.has_heading:
+            off = about_down(-heading_of(off)) @ off
+        return float(np.linalg.norm(log_so3(off)))
+
+
+def relative_attitude(a: DroneView, b: DroneView) -> RelativeAttitude | None:
+    """Return how two views' cameras are turned to each other; None where one has no attitude."""
+    if a.ned_from_body is None or b.ned_from_body is None:
+        return None
+    return RelativeAttitude(
+        a.ned_from_body @ a.body_from_cam.rotation,
+        b.ned_from_body @ b.body_from_cam.rotation,
+        a.has_heading and b.has_heading,
+    )
+
+
 def choose_hypothesis(
-    hypotheses: list[RelativePose], rotation_guess: Array | None, sigma_rad: float
+    hypotheses: list[RelativePose], attitude: RelativeAttitude | None, sigma_rad: float
 ) -> RelativePose | NoMap:
     """Choose between planar twins: by cost over all matches and by the measured attitudes.
 
     Args:
         hypotheses: all that explain the matches.
-        rotation_guess: (3, 3) b_from_a by the autopilots, or None.
-        sigma_rad: how far that guess may be off, 1 sigma.
+        attitude: of the two by the autopilots, or None.
+        sigma_rad: how far it may be off, 1 sigma.
 
     Returns:
         The one that explains matches and attitudes best, or a refusal when a
@@ -66,10 +104,9 @@ def choose_hypothesis(
     """
 
     def total(h: RelativePose) -> float:
-        if rotation_guess is None:
+        if attitude is None:
             return h.cost
-        angle = float(np.linalg.norm(log_so3(rotation_guess.T @ h.b_from_a.rotation)))
-        return h.cost + (angle / sigma_rad) ** 2
+        return h.cost + (attitude.off_rad(h.b_from_a.rotation) / sigma_rad) ** 2
 
     ranked = sorted(hypotheses, key=total)
     best = ranked[0]
@@ -94,22 +131,19 @@ def _degrees_apart(one: Pose, other: Pose) -> tuple[float, float]:
 def _edge(a: DroneView, b: DroneView, matches: PairMatches, options: MapOptions, seed: int) -> Edge:
     """Find the relative pose of two drones' cameras, or say why not."""
     names = f"drones {a.drone_id} and {b.drone_id}"
-    guess = None
-    if a.ned_from_body is not None and b.ned_from_body is not None:
-        ned_from_a = a.ned_from_body @ a.body_from_cam.rotation
-        guess = (b.ned_from_body @ b.body_from_cam.rotation).T @ ned_from_a
+    attitude = relative_attitude(a, b)
     hypotheses = relative_poses(
         a.camera.ideal_from_pixels(a.pixels[matches.a]),
         b.camera.ideal_from_pixels(b.pixels[matches.b]),
         0.5 * (a.camera.focal_px + b.camera.focal_px),
-        guess,
+        None if attitude is None else attitude.b_from_a,
         EssentialOptions(),
         seed,
     )
     none = PairMatches(matches.a[:0], matches.b[:0])
     if not hypotheses:
         return Edge(none, NoMap(f"{names} see too little in common ({len(matches.a)} matches)"))
-    chosen = choose_hypothesis(hypotheses, guess, np.deg2rad(options.attitude_sigma_deg))
+    chosen = choose_hypothesis(hypotheses, attitude, np.deg2rad(options.attitude_sigma_deg))
     cheapest = chosen if isinstance(chosen, RelativePose) else hypotheses[0]
     agreed = PairMatches(matches.a[cheapest.inliers], matches.b[cheapest.inliers])
     if isinstance(chosen, NoMap):

@@ -40,11 +40,12 @@ from vcl_companion.wire.reader import Reader
 # | 3  | u32 | request id                                                     |
 # | 7  | u64 | captured at, ns, the sender's own clock, below 2^63            |
 # | 15 | f64 | age of the frame when it was sent, s                           |
-# | 23 | u8  | what follows, a sum: 1 an attitude, 2 the drone's own pose     |
+# | 23 | u8  | a sum: 1 an attitude follows, 2 the drone's own pose, 4 the    |
+# |    |     | attitude's heading is by no north that others know             |
 # | 24 | rotation ned_from_body if so, pose world_from_body if so, pose body_from_cam, camera, |
 # |    | image: see pose_codec                                                                 |
 _HEAD = struct.Struct("<BIQdB")
-_HAS_ATTITUDE, _HAS_POSE = 1, 2
+_HAS_ATTITUDE, _HAS_POSE, _HAS_NO_HEADING = 1, 2, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +64,8 @@ class FrameAnswer:
         image_bytes: the encoded image (WebP).
         world_from_body: where that drone believes that it was, on the map that it
             flew on; None when it does not know.
+        has_heading: whether the attitude's heading is by the world's north, as far as
+            that drone knows; else only its roll and pitch tell others anything.
     """
 
     drone_id: int
@@ -74,6 +77,7 @@ class FrameAnswer:
     camera: Camera
     image_bytes: bytes
     world_from_body: Pose | None = None
+    has_heading: bool = True
 
     def __post_init__(self) -> None:
         if not 1 <= self.drone_id <= 255 or not 0 <= self.captured_at_ns < 1 << 63:
@@ -115,7 +119,9 @@ def encode_frame_body(frame: FrameAnswer) -> bytes:
                 frame.request_id,
                 frame.captured_at_ns,
                 frame.frame_age_s,
-                _HAS_ATTITUDE * bool(attitude) + _HAS_POSE * bool(pose),
+                _HAS_ATTITUDE * bool(attitude)
+                + _HAS_POSE * bool(pose)
+                + _HAS_NO_HEADING * (not frame.has_heading),
             ),
             attitude,
             pose,
@@ -146,7 +152,7 @@ def decode_frame(data: bytes, kind: BlobKind = BlobKind.FRAME_ANSWER) -> FrameAn
 def take_frame_body(reader: Reader) -> FrameAnswer:
     """Return the frame that comes next, or raise WireError."""
     drone_id, request_id, captured_at_ns, age_s, has = reader.unpack(_HEAD)
-    if has > _HAS_ATTITUDE + _HAS_POSE:
+    if has > _HAS_ATTITUDE + _HAS_POSE + _HAS_NO_HEADING:
         raise WireError(f"frame answer: unknown contents {has}")
     attitude = take_rotation(reader) if has & _HAS_ATTITUDE else None
     world_from_body = take_pose(reader) if has & _HAS_POSE else None
@@ -163,6 +169,7 @@ def take_frame_body(reader: Reader) -> FrameAnswer:
             camera,
             image_bytes,
             world_from_body,
+            not has & _HAS_NO_HEADING,
         )
     except ValueError as error:
         raise WireError(f"frame answer: {error}") from None
