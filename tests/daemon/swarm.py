@@ -172,7 +172,7 @@ class Drone:
         self.clock.advance_to(frame.captured_at_ns)
         taken = demo.shot(self.system_id).ned_from_body
         self.autopilot.measure(frame.captured_at_ns, taken.quaternion())
-        assert await self.autopilot_link.attitude_at(frame.captured_at_ns, 5.0) is not None
+        assert await self.autopilot_link.attitudes.at(frame.captured_at_ns, 5.0) is not None
         self.exchange.on_frame(frame)
 
     @property

@@ -113,7 +113,7 @@ def test_only_who_may_commands_only_us(
             one.autopilot.forward(PAUSE, 1.0, target=target, system=system)
             await until(lambda: one.autopilot_link.counters.refused.get(reason, 0) == 1)
             assert one.autopilot.answers.empty()
-            assert not one.autopilot_link.is_paused
+            assert not one.autopilot_link.poses.is_paused
 
     run(scenario())
 
@@ -170,7 +170,7 @@ def test_a_command_whose_answer_was_lost_is_not_obeyed_again(tmp_path: Path) -> 
             assert await last_answer(one) == (PAUSE, ACCEPTED, 255)
             one.autopilot.forward(PAUSE, 0.0, confirmation=1)
             assert await last_answer(one) == (PAUSE, ACCEPTED, 255)
-            assert not one.autopilot_link.is_paused
+            assert not one.autopilot_link.poses.is_paused
             await passes(3.0)
             one.autopilot.forward(PAUSE, 0.0, confirmation=1)
             assert await last_answer(one) == (PAUSE, ACCEPTED, 255)
@@ -194,7 +194,7 @@ def test_no_numbers_of_a_command_do_harm(tmp_path: Path) -> None:
                         answer = await last_answer(one)
                         assert answer[0] == command
                         assert command not in switches or answer[1] == DENIED
-            assert not one.autopilot_link.is_paused
+            assert not one.autopilot_link.poses.is_paused
             assert list((tmp_path / "maps").iterdir()) == []
 
     run(scenario())

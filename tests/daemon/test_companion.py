@@ -173,7 +173,7 @@ async def flight(
             history.add, health, log, executor, work, OPTIONS, frame_wait_s,
         )  # fmt: skip
         await stack.enter_async_context(beside(link.run()))
-        assert await link.attitude_at(first.at_ns, 5.0) is not None
+        assert await link.attitudes.at(first.at_ns, 5.0) is not None
         yield Flight(
             companion,
             estimator,

@@ -186,7 +186,7 @@ def test_a_pose_that_is_asked_for_is_the_next_one(tmp_path: Path) -> None:
             assert 0 < await interval_us(one, POSE) < 20_000_000
             # An autopilot would fuse the same measurement twice.
             assert one.autopilot.poses.qsize() == n_poses
-            await passes_until(lambda: one.autopilot_link.pose_interval_s is None)
+            await passes_until(lambda: one.autopilot_link.poses.interval_s is None)
             assert await answered(one, REQUEST, POSE) == BUSY
 
     run(scenario())

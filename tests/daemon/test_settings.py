@@ -63,11 +63,11 @@ def test_poses_are_paused_and_judged_by_what_was_set(tmp_path: Path) -> None:
             one = await members.start(1)
             await one.see(demo.frame(1, 0))
             assert await set_to(one, "VCL_PAUSED", 1.0) == 1.0
-            assert one.autopilot_link.is_paused
+            assert one.autopilot_link.poses.is_paused
             assert await set_to(one, "VCL_PAUSED", 1.0) == 1.0
             assert await set_to(one, "VCL_PAUSED", 0.5) == 1.0
             assert await set_to(one, "VCL_PAUSED", 0.0) == 0.0
-            assert not one.autopilot_link.is_paused
+            assert not one.autopilot_link.poses.is_paused
             assert one.autopilot.said_texts() == [
                 "VCL no poses are sent, as commanded",
                 "VCL_PAUSED: must be 0 or 1, got 0.5",

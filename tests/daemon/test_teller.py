@@ -77,7 +77,7 @@ class Flight:
             await asyncio.sleep(0)
 
     def _has_heard(self, at_ns: int) -> bool:
-        return (self.link.newest_attitude_ns() or 0) >= at_ns
+        return (self.link.attitudes.newest_ns() or 0) >= at_ns
 
     async def frame(self, k: int, *, is_seen: bool = True, late_ms: int = 0) -> FilterState | None:
         """Look at the k-th frame, when its time has come, and tell its pose."""
@@ -122,7 +122,7 @@ async def flying(
         estimator = Estimator(FilterOptions(coast_s=coast_s), LocalizationOptions(), lambda _: None)
         teller = Teller(link, estimator, clock, log, options or AutopilotOptions())
         async with beside(link.run(), teller.run()):
-            assert await link.attitude_at(START_NS, 5.0) is not None
+            assert await link.attitudes.at(START_NS, 5.0) is not None
             yield Flight(teller, estimator, autopilot, link, clock, path / "log")
 
 
@@ -218,7 +218,7 @@ def test_nothing_is_told_between_frames_while_paused(tmp_path: Path) -> None:
         async with flying(tmp_path) as up:
             for k in range(5):
                 await up.frame(k)
-            up.link.is_paused = True
+            up.link.poses.is_paused = True
             await up.turn_until(START_NS + 980 * MS)
             assert instants_ms(await up.told())[-1] == 800
             assert len(up.logged()) == 4

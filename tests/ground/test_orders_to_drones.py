@@ -45,10 +45,10 @@ def test_a_drone_does_what_the_command_says(tmp_path: Path) -> None:
                 assert (tmp_path / "saved.vclmap").read_bytes() == demo.encoded_map(1, 2)
                 status, lines = await vcl_ground(port, "pause")
                 assert (status, lines) == (0, ["drone 1: sends no poses"])
-                assert one.autopilot_link.is_paused
+                assert one.autopilot_link.poses.is_paused
                 status, lines = await vcl_ground(port, "resume")
                 assert (status, lines) == (0, ["drone 1: sends poses again"])
-                assert not one.autopilot_link.is_paused
+                assert not one.autopilot_link.poses.is_paused
                 assert (await vcl_ground(port, "save-map", "--forget"))[0] == 0
                 status, lines = await vcl_ground(port, "reload-map")
                 assert status == 1

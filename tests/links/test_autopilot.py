@@ -112,7 +112,7 @@ def test_attitude_is_interpolated_in_our_time() -> None:
             await autopilot.answer_question()
             autopilot.measure(NOW_NS - 20 * MS, turned(170.0))
             autopilot.measure(NOW_NS, turned(-170.0))
-            attitude = await link.attitude_at(NOW_NS - 5 * MS, 5.0)
+            attitude = await link.attitudes.at(NOW_NS - 5 * MS, 5.0)
             assert attitude is not None
             assert attitude.at_ns == NOW_NS - 5 * MS
             # Stamps are cut to milliseconds: 1 degree each here.
@@ -126,9 +126,9 @@ def test_attitude_waits_for_the_sample_that_is_on_its_way() -> None:
         async with linked(ManualClock(NOW_NS)) as (link, autopilot):
             await autopilot.answer_question()
             autopilot.measure(NOW_NS - 20 * MS, turned(10.0))
-            early = asyncio.create_task(link.attitude_at(NOW_NS - 20 * MS, 5.0))
+            early = asyncio.create_task(link.attitudes.at(NOW_NS - 20 * MS, 5.0))
             assert (await early) is not None
-            late = asyncio.create_task(link.attitude_at(NOW_NS, 5.0))
+            late = asyncio.create_task(link.attitudes.at(NOW_NS, 5.0))
             await asyncio.sleep(0)
             assert not late.done()
             autopilot.measure(NOW_NS, turned(20.0))
@@ -142,14 +142,14 @@ def test_attitude_waits_for_the_sample_that_is_on_its_way() -> None:
 def test_attitude_that_does_not_come_is_the_last_or_none() -> None:
     async def scenario() -> None:
         async with linked(ManualClock(NOW_NS)) as (link, autopilot):
-            assert await link.attitude_at(NOW_NS, 0.0) is None
+            assert await link.attitudes.at(NOW_NS, 0.0) is None
             await autopilot.answer_question()
             autopilot.measure(NOW_NS, turned(10.0))
-            assert await link.attitude_at(NOW_NS, 5.0) is not None
-            held = await link.attitude_at(NOW_NS + 90 * MS, 0.0)
+            assert await link.attitudes.at(NOW_NS, 5.0) is not None
+            held = await link.attitudes.at(NOW_NS + 90 * MS, 0.0)
             assert held is not None
             assert abs(held.at_ns - NOW_NS) <= MS
-            assert await link.attitude_at(NOW_NS + 110 * MS, 0.001) is None
+            assert await link.attitudes.at(NOW_NS + 110 * MS, 0.001) is None
 
     asyncio.run(scenario())
 
@@ -162,14 +162,14 @@ def test_quaternions_are_preferred_to_angles() -> None:
             yaw = math.radians(30.0)
             angles = wire.packed(wire.ATTITUDE, boot_ms, 0, 0, yaw, 0, 0, 0, system=SYSTEM)
             autopilot.say(angles)
-            by_angles = await link.attitude_at(NOW_NS, 5.0)
+            by_angles = await link.attitudes.at(NOW_NS, 5.0)
             assert by_angles is not None
             assert degrees_off(by_angles.ned_from_body, turned(30.0)) < 1e-4
             autopilot.measure(NOW_NS, turned(40.0))
             autopilot.measure(NOW_NS + 20 * MS, turned(40.0))
             later = wire.packed(wire.ATTITUDE, boot_ms + 40, 0, 0, yaw, 0, 0, 0, system=SYSTEM)
             autopilot.say(later)
-            attitude = await link.attitude_at(NOW_NS + 20 * MS, 5.0)
+            attitude = await link.attitudes.at(NOW_NS + 20 * MS, 5.0)
             assert attitude is not None
             assert degrees_off(attitude.ned_from_body, turned(40.0)) < 1e-4
 
@@ -182,10 +182,10 @@ def test_an_autopilot_without_timesync_is_timed_by_arrival() -> None:
         async with linked(clock) as (link, autopilot):
             await autopilot.next_of(wire.TIMESYNC)
             autopilot.measure(NOW_NS, turned(10.0))
-            assert await link.attitude_at(NOW_NS, 0.05) is None
+            assert await link.attitudes.at(NOW_NS, 0.05) is None
             for _ in range(10):
                 await autopilot.next_of(wire.TIMESYNC)
-            attitude = await link.attitude_at(NOW_NS, 0.0)
+            attitude = await link.attitudes.at(NOW_NS, 0.0)
             assert attitude is not None
             assert attitude.at_ns == NOW_NS - 10 * MS
 
@@ -197,22 +197,22 @@ def test_a_restarted_autopilot_is_timed_anew() -> None:
         async with linked(ManualClock(NOW_NS)) as (link, autopilot):
             await autopilot.answer_question()
             autopilot.measure(NOW_NS, turned(10.0))
-            assert await link.attitude_at(NOW_NS, 5.0) is not None
+            assert await link.attitudes.at(NOW_NS, 5.0) is not None
             restarted = wire.packed(
                 wire.ATTITUDE_QUATERNION, 3000, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, system=SYSTEM
             )
             for _ in range(2):  # asked for as the link came up
                 await autopilot.next_of(wire.COMMAND_LONG)
             autopilot.say(restarted)
-            while link.round_trip_s is not None:
-                await link.attitude_at(NOW_NS + 1000 * MS, 0.01)
+            while link.attitudes.round_trip_s is not None:
+                await link.attitudes.at(NOW_NS + 1000 * MS, 0.01)
             # It has forgotten what it was asked to send.
             async with asyncio.timeout(0.8):  # else asked for after a second
                 assert (await autopilot.next_of(wire.COMMAND_LONG)).fields[7] == 511
             question = await autopilot.next_of(wire.TIMESYNC)
             answer = wire.packed(wire.TIMESYNC, 3000 * MS, question.fields[1], system=SYSTEM)
             autopilot.say(answer)
-            attitude = await link.attitude_at(NOW_NS, 5.0)
+            attitude = await link.attitudes.at(NOW_NS, 5.0)
             assert attitude is not None
             assert degrees_off(attitude.ned_from_body, np.eye(3)) < 1e-4
 
@@ -230,7 +230,7 @@ def test_only_the_own_autopilot_is_heard() -> None:
             )
             autopilot.say(b"garbage")
             autopilot.measure(NOW_NS + 100 * MS, turned(10.0))
-            attitude = await link.attitude_at(NOW_NS + 100 * MS, 5.0)
+            attitude = await link.attitudes.at(NOW_NS + 100 * MS, 5.0)
             assert attitude is not None
             assert attitude.at_ns > NOW_NS + 99 * MS
             refused = link.counters.refused
@@ -255,7 +255,7 @@ def test_a_pose_goes_out_with_its_own_time_and_covariance() -> None:
     async def scenario() -> wire.Seen:
         async with linked(ManualClock(NOW_NS)) as (link, autopilot):
             await autopilot.next_of(wire.HEARTBEAT)
-            assert link.send_pose(at_rest(pose, covariance, NOW_NS - 12_345_678, 258)) is None
+            assert link.poses.send(at_rest(pose, covariance, NOW_NS - 12_345_678, 258)) is None
             return await autopilot.next_of(wire.VISION_POSITION_ESTIMATE)
 
     seen = asyncio.run(scenario())
@@ -279,8 +279,8 @@ def test_a_pose_that_would_harm_is_not_sent(bad: float) -> None:
     async def scenario() -> None:
         async with linked(ManualClock(NOW_NS)) as (link, autopilot):
             await autopilot.next_of(wire.HEARTBEAT)
-            assert link.send_pose(at_rest(pose, covariance)) is not None
-            assert link.send_pose(at_rest(pose, np.eye(6))) is None
+            assert link.poses.send(at_rest(pose, covariance)) is not None
+            assert link.poses.send(at_rest(pose, np.eye(6))) is None
             assert (await autopilot.next_of(wire.VISION_POSITION_ESTIMATE)).fields[28] > 0
             (reason,) = [r for r in link.counters.refused if r.startswith("pose not sent")]
             assert link.counters.refused[reason] == 1
@@ -294,7 +294,7 @@ def test_rounding_below_zero_is_sent_as_zero() -> None:
     async def scenario() -> None:
         async with linked(ManualClock(NOW_NS)) as (link, autopilot):
             await autopilot.next_of(wire.HEARTBEAT)
-            assert link.send_pose(at_rest(Pose.identity(), covariance)) is None
+            assert link.poses.send(at_rest(Pose.identity(), covariance)) is None
             seen = await autopilot.next_of(wire.VISION_POSITION_ESTIMATE)
             diagonal = [seen.fields[7 + k] for k in (0, 6, 11, 15, 18, 20)]
             assert diagonal == [1, 1, 0, 1, 1, 1]
@@ -367,11 +367,11 @@ def test_what_is_too_old_is_not_sent_and_what_is_late_is_told_vaguely() -> None:
     async def scenario() -> None:
         async with linked(ManualClock(NOW_NS)) as (link, autopilot):
             await autopilot.next_of(wire.HEARTBEAT)
-            assert link.send_pose(aged(2.1)) == "its pose was 2.1 s old"
+            assert link.poses.send(aged(2.1)) == "its pose was 2.1 s old"
             assert link.counters.refused["pose not sent: too old"] == 1
             sigmas = []
             for age_s in (0.0, 0.2, 0.7):
-                assert link.send_pose(aged(age_s)) is None
+                assert link.poses.send(aged(age_s)) is None
                 seen = await autopilot.next_of(wire.VISION_POSITION_ESTIMATE)
                 sigmas.append(math.sqrt(seen.fields[7]))
             assert sigmas[0] == sigmas[1] < 0.02

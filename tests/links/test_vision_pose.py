@@ -132,7 +132,7 @@ def sent(options: dict[str, Any], autopilot: int, message_id: int) -> tuple[Any,
                 question = wire.packed(wire.TIMESYNC, 0, 1, system=SYSTEM)
                 side.transport.sendto(beat + question, where)
                 await next_of(side, wire.TIMESYNC, lambda fields: fields[0] != 0)
-                assert link.send_pose(estimate(speed=SPEED)) is None
+                assert link.poses.send(estimate(speed=SPEED)) is None
                 return await next_of(side, message_id, lambda _: True)
 
     return asyncio.run(scenario()).fields

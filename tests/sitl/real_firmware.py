@@ -147,7 +147,7 @@ class Flight:
         estimate = PoseEstimate(
             told, covariance, there.velocities_m_s[0], 0.01 * np.eye(3), at_ns, self.n_resets
         )
-        assert self.link.send_pose(estimate) is None
+        assert self.link.poses.send(estimate) is None
 
     def true_at(self, at_ns: int) -> Array:
         """Return (3,) where it was."""

@@ -72,7 +72,7 @@ class Companion:
         told = LOCAL_FROM_NED @ self.true[-1]
         covariance = np.diag([0.02**2] * 3 + [1e-4] * 3)
         estimate = PoseEstimate(told, covariance, np.zeros(3), 0.01 * np.eye(3), at_ns, 0)
-        assert self.link.send_pose(estimate) is None
+        assert self.link.poses.send(estimate) is None
 
 
 async def flown(tmp_path: Path, seconds: float, silent_after_s: float = np.inf) -> Companion:

@@ -158,7 +158,7 @@ def attitudes_of(frames_at_ns: list[int], out: Path, source: dict[str, object]) 
                 for at_ns in frames_at_ns:
                     await process.advance_to(at_ns)
                     clock.advance_to(at_ns)
-                    attitude = await link.attitude_at(at_ns, LONGEST_S)
+                    attitude = await link.attitudes.at(at_ns, LONGEST_S)
                     assert attitude is not None
                     assert abs(attitude.at_ns - at_ns) <= MS
                     found.append(attitude.ned_from_body)
@@ -212,13 +212,13 @@ def test_it_knows_no_north_until_it_is_told_poses(tmp_path: Path) -> None:
                 for at_ns in frames_at_ns:
                     await process.advance_to(at_ns)
                     clock.advance_to(at_ns)
-                    await link.attitude_at(at_ns, LONGEST_S)
+                    await link.attitudes.at(at_ns, LONGEST_S)
                     assert not link.has_heading
                     if at_ns == frames_at_ns[9]:
                         estimate = PoseEstimate(
                             told, np.eye(6) * 1e-4, np.zeros(3), np.eye(3), at_ns, 1
                         )
-                        assert link.send_pose(estimate) is None
+                        assert link.poses.send(estimate) is None
                         await until(lambda: bool(received(out, "VISION_POSITION_ESTIMATE")))
                 await process.finish()
 
@@ -515,10 +515,10 @@ def overheard_poses(
                 link.set_state(ServiceState.ACTIVE)
                 async with running(link.run()):
                     await opinion.meet()
-                    assert await link.attitude_at(START_NS, LONGEST_S) is not None
+                    assert await link.attitudes.at(START_NS, LONGEST_S) is not None
                     link.say(Severity.WARNING, "no map yet")
                     for pose, covariance, at_ns, reset_counter in poses():
-                        sent = link.send_pose(
+                        sent = link.poses.send(
                             PoseEstimate(
                                 pose, covariance, VELOCITY, np.eye(3), at_ns, reset_counter
                             )

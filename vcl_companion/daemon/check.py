@@ -149,7 +149,7 @@ async def of_autopilot(config: Config, link: AutopilotLink) -> tuple[list[Check]
         return [Check("autopilot", "failure", what, advice)], []
     checks = [Check("autopilot", "ok", f"{link.firmware.value}, system {config.system_id}")]
     await asyncio.sleep(_STREAM_S)
-    rate_hz, wanted_hz = link.attitude_rate_hz, config.autopilot.attitude_rate_hz
+    rate_hz, wanted_hz = link.attitudes.rate_hz, config.autopilot.attitude_rate_hz
     what = f"attitude comes at {rate_hz:.0f} of {wanted_hz:.0f} Hz"
     if rate_hz < _LEAST_ATTITUDE_SHARE * wanted_hz:
         checks.append(Check("link", "failure", what, "a faster baud rate, or fewer other streams"))
@@ -180,7 +180,7 @@ async def of_autopilot(config: Config, link: AutopilotLink) -> tuple[list[Check]
 
 
 def _of_time(link: AutopilotLink) -> Check:
-    round_trip_s = link.round_trip_s
+    round_trip_s = link.attitudes.round_trip_s
     if round_trip_s is None:
         advice = "TIMESYNC: attitudes are timed by arrival, and a PX4 does not fuse"
         grade: Grade = "failure" if link.firmware is Firmware.PX4 else "warning"

@@ -132,7 +132,7 @@ async def _listen(motion: Motion, link: AutopilotLink, clock: Clock) -> None:
     next_ns = clock.now_ns()
     while True:
         while next_ns < clock.now_ns() - _SETTLED_NS:
-            attitude = await link.attitude_at(next_ns, 0.0)
+            attitude = await link.attitudes.at(next_ns, 0.0)
             # Only what was said of that instant, not of the nearest that there is.
             if attitude is not None and attitude.at_ns == next_ns:
                 motion.said_ns.append(next_ns)

@@ -152,7 +152,7 @@ class Commands:
 
     def pause(self, is_paused: bool) -> None:
         """Hold poses back, or send them again, because the ground wants it."""
-        self._autopilot.is_paused = is_paused
+        self._autopilot.poses.is_paused = is_paused
         what = "no poses are sent" if is_paused else "poses are sent again"
         self._autopilot.announce(Severity.WARNING, f"VCL {what}, as commanded")
 

@@ -253,7 +253,7 @@ class Companion:
         return await self._ask(frame, ned_from_body, stored, refused)
 
     async def _attitude_of(self, frame: Frame) -> Array | None:
-        attitude = await self._autopilot.attitude_at(frame.captured_at_ns, ATTITUDE_WAIT_S)
+        attitude = await self._autopilot.attitudes.at(frame.captured_at_ns, ATTITUDE_WAIT_S)
         return None if attitude is None else attitude.ned_from_body
 
     async def _looked_at(

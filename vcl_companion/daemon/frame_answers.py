@@ -163,7 +163,7 @@ class FrameAnswers:
             ValueError: the frame is over an hour old, or cannot be encoded.
         """
         at_ns = frame.captured_at_ns
-        attitude = await self._autopilot.attitude_at(at_ns, ATTITUDE_WAIT_S)
+        attitude = await self._autopilot.attitudes.at(at_ns, ATTITUDE_WAIT_S)
         if self._estimator.is_localized(self._clock.now_ns()):
             await self._estimator.looked_at(at_ns, _SETTLE_S)
         state = self._estimator.own_fix_at(at_ns)

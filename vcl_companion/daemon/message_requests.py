@@ -114,8 +114,8 @@ class MessageRequests:
             return RESULT_ACCEPTED, lambda: self._autopilot.send(self._version)
         if message_id == ONBOARD_COMPUTER_STATUS_ID:
             return RESULT_ACCEPTED, self._want_status
-        if message_id == self._autopilot.pose_message_id:
-            is_sent = self._autopilot.pose_interval_s is not None
+        if message_id == self._autopilot.poses.message_id:
+            is_sent = self._autopilot.poses.interval_s is not None
             return (RESULT_ACCEPTED if is_sent else RESULT_TEMPORARILY_REJECTED), None
         return RESULT_UNSUPPORTED, None
 
@@ -125,7 +125,7 @@ class MessageRequests:
 
     def _set_interval(self, message_id: int, interval_us: float) -> int:
         if message_id != ONBOARD_COMPUTER_STATUS_ID:
-            ours = (HEARTBEAT_ID, AUTOPILOT_VERSION_ID, self._autopilot.pose_message_id)
+            ours = (HEARTBEAT_ID, AUTOPILOT_VERSION_ID, self._autopilot.poses.message_id)
             return RESULT_DENIED if message_id in ours else RESULT_UNSUPPORTED
         if interval_us == _NEVER:
             self._interval_s = None
@@ -144,9 +144,9 @@ class MessageRequests:
             interval_us = _HEARTBEAT_US
         elif message_id == AUTOPILOT_VERSION_ID:
             interval_us = _NOT_STREAMED_US
-        elif message_id in (ONBOARD_COMPUTER_STATUS_ID, self._autopilot.pose_message_id):
+        elif message_id in (ONBOARD_COMPUTER_STATUS_ID, self._autopilot.poses.message_id):
             is_status = message_id == ONBOARD_COMPUTER_STATUS_ID
-            interval_s = self._interval_s if is_status else self._autopilot.pose_interval_s
+            interval_s = self._interval_s if is_status else self._autopilot.poses.interval_s
             # Several frames may be answered at one instant of a recording.
             interval_us = (
                 _NOT_STREAMED_US if interval_s is None else max(round(1e6 * interval_s), 1)

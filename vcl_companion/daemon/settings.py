@@ -86,7 +86,7 @@ def _settings(
     def set_paused(value: float) -> None:
         if value not in (0.0, 1.0):
             raise ValueError(f"must be 0 or 1, got {value:g}")
-        if bool(value) != autopilot.is_paused:
+        if bool(value) != autopilot.poses.is_paused:
             pause(bool(value))
 
     def of_poses(field: str) -> float:
@@ -105,7 +105,7 @@ def _settings(
         change: dict[str, Any] = {field: int(value) if field in _WHOLE else value}
         exchange.update_options = replace(exchange.update_options, **change)
 
-    yield Setting(_PAUSED, lambda: float(autopilot.is_paused), set_paused)
+    yield Setting(_PAUSED, lambda: float(autopilot.poses.is_paused), set_paused)
     for name, field in _POSES.items():
         yield Setting(name, partial(of_poses, field), partial(set_of_poses, field))
     for name, field in _UPDATES.items():

@@ -77,7 +77,7 @@ class StatusWriter:
     def status(self) -> ServiceStatus:
         """Return how the service is now."""
         fusion, ahead_s = self._autopilot.fusion(), self._autopilot.ahead_s
-        round_trip_s = self._autopilot.round_trip_s
+        round_trip_s = self._autopilot.attitudes.round_trip_s
         stored, sigma_m = self._maps.current, self._estimator.sigma_m
         return ServiceStatus(
             self._system_id,

@@ -121,7 +121,7 @@ class Teller:
     async def run(self) -> None:
         """Tell what is due between frames as the autopilot's attitude of then comes in."""
         while True:
-            await self._autopilot.news()
+            await self._autopilot.attitudes.news()
             self._tell_between(None)
 
     def _tell_between(self, until_ns: int | None) -> None:
@@ -135,14 +135,14 @@ class Teller:
                 return
             at_ns = between.at_ns
             if until_ns is None:
-                newest_ns = self._autopilot.newest_attitude_ns()
+                newest_ns = self._autopilot.attitudes.newest_ns()
                 if now_ns < between.due_ns or newest_ns is None or newest_ns < at_ns:
                     return
             elif self._is_too_near(at_ns, until_ns):
                 return
             if any(self._is_too_near(at_ns, frame_ns) for frame_ns in self._still_unseen()):
                 return
-            attitude = self._autopilot.known_attitude(at_ns)
+            attitude = self._autopilot.attitudes.known(at_ns)
             ned_from_body = None if attitude is None else attitude.ned_from_body
             state = self._estimator.propagated(at_ns, ned_from_body, self._propagate_s)
             if state is None:
@@ -168,7 +168,7 @@ class Teller:
             at_ns: the instant.
             share: see ``covariance_between``; None for a frame's pose.
         """
-        if self._autopilot.is_paused:
+        if self._autopilot.poses.is_paused:
             return "paused by the ground"
         local = self._estimator.local
         if not local.settles(state):
@@ -186,7 +186,7 @@ class Teller:
             covariance, velocity = covariance_between(covariance, velocity, share)
         told, slides_m_s = self._resets.told(pose, at_ns)
         turn = self._resets.turn @ local_from_world.rotation
-        why_not = self._autopilot.send_pose(
+        why_not = self._autopilot.poses.send(
             PoseEstimate(
                 told,
                 covariance,

@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
-from collections import deque
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from vcl_companion.clock import Clock
-from vcl_companion.geometry.rotation import Array, euler_from_matrix, quaternion_from_matrix
-from vcl_companion.links.attitude import Attitude, AttitudeHistory
+from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot_options import AutopilotOptions, ServiceState
 from vcl_companion.links.counters import LinkCounters, LinkTally
 from vcl_companion.links.fusion import Fusion, FusionMonitor
@@ -26,15 +21,11 @@ from vcl_companion.links.messages import (
     COMPONENT_COMPANION,
     EKF_STATUS_REPORT_ID,
     ESTIMATOR_STATUS_ID,
-    FRAME_LOCAL_FRD,
-    FRAME_LOCAL_NED,
     GLOBAL_ORIGIN_ID,
     LOCAL_POSITION_ID,
-    ODOMETRY_ID,
     RESULT_ACCEPTED,
     SET_GLOBAL_ORIGIN,
     SET_MESSAGE_INTERVAL,
-    VISION_POSITION_ESTIMATE_ID,
     AttitudeSample,
     CommandAck,
     CommandLong,
@@ -50,28 +41,18 @@ from vcl_companion.links.messages import (
 )
 from vcl_companion.links.origin import GlobalPlace, OriginSetter
 from vcl_companion.links.parameters import Parameters
+from vcl_companion.links.pose_sender import PoseSender
 from vcl_companion.links.reconnect import Address
 from vcl_companion.links.stream_requests import StreamRequests
 from vcl_companion.links.texts import Severity, Texts
-from vcl_companion.links.timesync import TimesyncEstimator
+from vcl_companion.links.timed_attitude import TimedAttitude
 from vcl_companion.links.transport import open_transport
 from vcl_companion.links.vehicle_mode import VehicleMode, mode_of
-from vcl_companion.links.vision_pose import Firmware, PoseEstimate, covariance_for, firmware_of
+from vcl_companion.links.vision_pose import Firmware, firmware_of
 
 _log = logging.getLogger(__name__)
 
 _HEARTBEAT_S = 1.0
-# Questions come quickly until the estimate has enough to choose from.
-_SYNC_FAST_S, _SYNC_SLOW_S = 0.1, 1.0
-_SYNC_ENOUGH = 8
-# After this many unanswered questions (1 s) the autopilot does without TIMESYNC.
-_SYNC_GIVEN_UP = 10
-# How far back estimators fuse: EKF2_DELAY_MAX; VISO_DELAY_MS goes up to 0.25.
-_REMEMBERS_S = 0.2
-# Poses were sent for as long as the last one is no older; how often, the last ten say.
-_POSES_LAST_S, _POSES_COUNTED = 1.0, 10
-# 0 is what an autopilot that has heard of none takes for known.
-_RESETS = 255
 _FIRMWARE = {"ardupilot": Firmware.ARDUPILOT, "px4": Firmware.PX4}
 
 
@@ -87,23 +68,19 @@ class AutopilotLink:
         self._transport = open_transport(
             options.link, self._tally, allowed_senders=options.allowed_senders
         )
-        latency_ns = round(options.attitude_latency_s * 1e9)
-        max_age_ns = round(options.max_attitude_age_s * 1e9)
-        self._by_quaternion = AttitudeHistory(latency_ns, max_age_ns)
-        self._by_euler = AttitudeHistory(latency_ns, max_age_ns)
         self._streams = StreamRequests(options.attitude_rate_hz, self._request_stream)
         self._texts = Texts(self._codec, self._transport)
-        self.is_paused = False
-        """Whether poses are held back, as the ground has commanded."""
         self.on_command: Callable[[CommandLong], None] | None = None
         self.on_parameter: Callable[[ParameterOrder], None] | None = None
         """Shown who asks for a parameter of ours, or sets one; only ground systems may set."""
-        self._sent_at_s: deque[float] = deque(maxlen=_POSES_COUNTED)
         self._parameters = Parameters(self._read_parameter, self._write_parameter)
         self._fusion = FusionMonitor()
-        self._sync = TimesyncEstimator()
-        self._asked_at_s = -math.inf
-        self._news = asyncio.Event()
+        self.attitudes = TimedAttitude(options, clock, self._ask_for_time)
+        """What it says of how it is turned, by our clock."""
+        self.poses = PoseSender(
+            options, self._codec, self._transport.write, clock, self._tally, self._fusion
+        )
+        """Tells it where it is."""
         self._state = ServiceState.STARTING
         self.origin = OriginSetter(
             None if options.origin is None else GlobalPlace(*options.origin),
@@ -118,9 +95,9 @@ class AutopilotLink:
         self._firmware = _FIRMWARE.get(options.profile, Firmware.OTHER)
         if options.profile != "auto":
             self._heading.is_of(self._firmware)
-        for told in (self._streams, self._fusion, self.origin):
+        self._told_firmware = (self._streams, self._fusion, self.origin, self.poses)
+        for told in self._told_firmware:
             told.firmware = self._firmware
-        self._first_reset: int | None = None
         self._mode = VehicleMode()
 
     @property
@@ -130,39 +107,19 @@ class AutopilotLink:
 
     @options.setter
     def options(self, options: AutopilotOptions) -> None:
-        self._options = options
-
-    @property
-    def pose_message_id(self) -> int:
-        """In which message poses are sent."""
-        by_vision = self._options.message == "vision_position_estimate"
-        return VISION_POSITION_ESTIMATE_ID if by_vision else ODOMETRY_ID
-
-    @property
-    def pose_interval_s(self) -> float | None:
-        """From one pose that was sent to the next, s; None when none goes out now."""
-        now_s = asyncio.get_running_loop().time()
-        sent = self._sent_at_s
-        if len(sent) < 2 or now_s - sent[-1] > _POSES_LAST_S:
-            return None
-        return (sent[-1] - sent[0]) / (len(sent) - 1)
+        self._options = self.poses.options = options
 
     @property
     def counters(self) -> LinkCounters:
         """What went over the link so far."""
         return self._tally.snapshot()
 
-    @property
-    def round_trip_s(self) -> float | None:
-        """Shortest recent TIMESYNC round trip, s; None without one."""
-        return self._sync.round_trip_s
-
     async def run(self) -> None:
         """Keep the link alive until cancelled."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self._transport.run(self._receive, self._greet))
             group.create_task(self._heartbeats())
-            group.create_task(self._questions())
+            group.create_task(self.attitudes.run())
             group.create_task(self._streams.run())
             group.create_task(self.origin.run())
             group.create_task(self._heading.run())
@@ -176,11 +133,6 @@ class AutopilotLink:
     def has_heading(self) -> bool:
         """Whether the heading of its attitudes is its own, a compass's, and not what we tell it."""
         return self._heading.is_own
-
-    @property
-    def attitude_rate_hz(self) -> float:
-        """How often ATTITUDE_QUATERNION came in the last seconds, Hz."""
-        return self._by_quaternion.rate_hz
 
     def answer(self, message: CommandLong, result: int, progress: int = 255) -> None:
         """Say what became of a command, to who gave it: MAV_RESULT, and percent of its way."""
@@ -230,115 +182,6 @@ class AutopilotLink:
         """By how much the autopilot takes our poses for older than they are, s; None: unknown."""
         return self._fusion.ahead_s
 
-    async def attitude_at(self, at_ns: int, wait_s: float) -> Attitude | None:
-        """Return the attitude at an instant of our clock.
-
-        Waits until a sample at or after the instant has come, ``wait_s`` at most,
-        then takes what there is: None when nothing lies within the option
-        ``max_attitude_age_s``, or while it is not known yet whose time is whose.
-        """
-        loop = asyncio.get_running_loop()
-        deadline_s = loop.time() + wait_s
-        while True:
-            offset_ns = self._offset_ns(at_ns)
-            if offset_ns is not None and self._history(at_ns, offset_ns).covers(at_ns, offset_ns):
-                break
-            if offset_ns is None:
-                self._ask_if_due(_SYNC_FAST_S)
-            remaining_s = deadline_s - loop.time()
-            if remaining_s <= 0.0:
-                break
-            try:
-                async with asyncio.timeout(remaining_s):
-                    await self._news.wait()
-            except TimeoutError:
-                break
-        # A good moment to ask: in a replay the clocks of all processes stand together now.
-        self._ask_if_due(_SYNC_SLOW_S)
-        return self.known_attitude(at_ns)
-
-    def known_attitude(self, at_ns: int) -> Attitude | None:
-        """Return the attitude at an instant of our clock by what has come; see ``attitude_at``."""
-        offset_ns = self._offset_ns(at_ns)
-        if offset_ns is None:
-            return None
-        return self._history(at_ns, offset_ns).at(at_ns, offset_ns)
-
-    async def news(self) -> None:
-        """Wait until the autopilot says how it is turned, or what time it is."""
-        await self._news.wait()
-
-    def newest_attitude_ns(self) -> int | None:
-        """Return the instant of the newest attitude, our clock; None while it is not known."""
-        now_ns = self._clock.now_ns()
-        offset_ns = self._offset_ns(now_ns)
-        return None if offset_ns is None else self._history(now_ns, offset_ns).newest_ns(offset_ns)
-
-    def send_pose(self, estimate: PoseEstimate, *, is_of_frame: bool = True) -> str | None:
-        """Send where we were, as the autopilot's firmware wants to be told.
-
-        Args:
-            estimate: where.
-            is_of_frame: whether a frame gave it; what lies between tells nothing of whether the
-                autopilot follows us.
-
-        Returns:
-            None when it was sent; else why not: the ground has paused it, it is too old, or the
-            covariance is not finite or has a negative variance.
-        """
-        if self.is_paused:
-            return "paused by the ground"
-        age_s = (self._clock.now_ns() - estimate.at_ns) * 1e-9
-        if age_s > self._options.max_pose_age_s:
-            self._tally.refuse("pose not sent: too old")
-            return f"its pose was {age_s:.1f} s old"
-        # It takes what is older than it remembers for the oldest that it does.
-        time_error_s = math.hypot(self._options.time_error_s, max(0.0, age_s - _REMEMBERS_S))
-        covariance = covariance_for(self._firmware, estimate, time_error_s)
-        if isinstance(covariance, str):
-            self._tally.refuse(f"pose not sent: {covariance}")
-            return f"the pose's covariance is not one: {covariance}"
-        pose = estimate.local_from_body
-        x_m, y_m, z_m = pose.translation.tolist()
-        usec, reset_counter = estimate.at_ns // 1000, self._reset_counter(estimate.n_resets)
-        if self._options.message == "vision_position_estimate":
-            angles = euler_from_matrix(pose.rotation)
-            frame = self._codec.vision_position_estimate(
-                usec, (x_m, y_m, z_m), angles, covariance, reset_counter
-            )
-        else:
-            turn = pose.rotation.T
-            # ArduPilot drops what is not FRD; PX4 takes FRD for turned, and NED as it is.
-            is_px4 = self._firmware is Firmware.PX4
-            frame = self._codec.odometry(
-                usec,
-                FRAME_LOCAL_NED if is_px4 else FRAME_LOCAL_FRD,
-                (x_m, y_m, z_m),
-                tuple(quaternion_from_matrix(pose.rotation).tolist()),
-                tuple((turn @ estimate.velocity_local_m_s).tolist()),
-                covariance,
-                turn @ estimate.velocity_covariance @ turn.T,
-                reset_counter,
-            )
-        self._transport.write(frame)
-        self._sent_at_s.append(asyncio.get_running_loop().time())
-        if not is_of_frame:
-            self._fusion.sent_between(estimate.at_ns)
-            return None
-        sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0))
-        self._fusion.sent(estimate.at_ns, pose.translation, sigma_m, estimate.n_resets)
-        return None
-
-    def _reset_counter(self, n_resets: int) -> int:
-        """Return a counter that is not the autopilot's own first one, nor our last run's.
-
-        An ArduPilot that has heard of no reset begins at its origin. Its first pose then, 2.7 m
-        from there, is a step to it, and not a beginning: it believed to fly at 75 m/s.
-        """
-        if self._first_reset is None:
-            self._first_reset = self._clock.now_ns() // 1_000_000_000
-        return 1 + (self._first_reset + n_resets) % _RESETS
-
     def set_state(self, state: ServiceState) -> None:
         """Say from the next heartbeat on how we are."""
         self._state = state
@@ -350,20 +193,6 @@ class AutopilotLink:
     def announce(self, severity: Severity, text: str) -> None:
         """Send STATUSTEXT of something that has happened: once, whatever the link does."""
         self._texts.announce(severity, text)
-
-    def _history(self, at_ns: int, offset_ns: int) -> AttitudeHistory:
-        if self._by_quaternion.is_near(at_ns, offset_ns):
-            return self._by_quaternion
-        return self._by_euler
-
-    def _offset_ns(self, at_ns: int) -> int | None:
-        """Return our clock minus the autopilot's; None while its answer may still come."""
-        offset_ns = self._sync.offset_ns(at_ns)
-        if offset_ns is None and self._sync.unanswered >= _SYNC_GIVEN_UP:
-            offset_ns = self._by_quaternion.offset_by_arrival_ns()
-            if offset_ns is None:
-                offset_ns = self._by_euler.offset_by_arrival_ns()
-        return offset_ns
 
     def _receive(self, data: bytes, _: Address | None) -> bool:
         accepted = False
@@ -388,10 +217,9 @@ class AutopilotLink:
                 now_ns = max(1, self._clock.now_ns())
                 self._transport.write(self._codec.timesync(now_ns, ts1_ns))
             case Timesync(tc1_ns=tc1_ns, ts1_ns=ts1_ns):
-                refusal = self._sync.answered(ts1_ns, tc1_ns, self._clock.now_ns())
+                refusal = self.attitudes.answered(ts1_ns, tc1_ns)
                 if refusal is not None:
                     self._tally.refuse(refusal)
-                self._wake()
             case AttitudeSample():
                 self._take_attitude(message)
             case ParameterValue():
@@ -442,7 +270,7 @@ class AutopilotLink:
 
     def _take_position(self, message: LocalPosition) -> None:
         self.origin.height_m = -float(message.position[2])
-        offset_ns = self._offset_ns(self._clock.now_ns())
+        offset_ns = self.attitudes.offset_ns(self._clock.now_ns())
         if offset_ns is not None:
             measured_ns = message.time_boot_ms * 1_000_000 + offset_ns
             self._fusion.believes(measured_ns, message.position, message.velocity)
@@ -452,40 +280,27 @@ class AutopilotLink:
         if firmware is not self._firmware:
             self._firmware = firmware
             _log.info("the autopilot's firmware: %s", firmware.value)
-            for told in (self._streams, self._fusion, self.origin):
+            for told in self._told_firmware:
                 told.firmware = firmware
             self._streams.ask_for_all()
 
     def _take_attitude(self, sample: AttitudeSample) -> None:
-        quaternion = sample.source == "quaternion"
-        if quaternion:
+        if sample.source == "quaternion":
             self._streams.heard(ATTITUDE_QUATERNION_ID)
-        history = self._by_quaternion if quaternion else self._by_euler
-        match history.add(sample, self._clock.now_ns()):
+        match self.attitudes.take(sample):
             case "overtaken":
                 self._tally.refuse("attitude overtaken by a later one")
-            case "turned":
-                degrees = math.degrees(history.north_rad)
-                _log.info("the autopilot has turned its north, by %.1f degrees so far", degrees)
             case "rebooted":
                 _log.warning("the autopilot has restarted")
-                self._sync.reset()
-                self._fusion = FusionMonitor()
+                self._fusion.forget()
                 self._streams.ask_for_all()
                 self.origin.forget()
                 self._heading.forget()
-                (self._by_euler if quaternion else self._by_quaternion).clear()
-        self._wake()
-
-    def _wake(self) -> None:
-        self._news.set()
-        self._news.clear()
 
     def _greet(self) -> None:
         """Make ourselves known on a link that has just come up."""
         self.send_heartbeat()
-        if self._clock.now_ns() > 0:
-            self._ask_if_due(0.0)
+        self.attitudes.ask_now()
         self._streams.ask_for_all()
         self._texts.say_again()
 
@@ -494,21 +309,8 @@ class AutopilotLink:
             await asyncio.sleep(_HEARTBEAT_S)
             self.send_heartbeat()
 
-    async def _questions(self) -> None:
-        while True:
-            await asyncio.sleep(_SYNC_FAST_S)
-            settled = self._sync.n_exchanges >= _SYNC_ENOUGH
-            hopeless = self._sync.unanswered >= _SYNC_GIVEN_UP
-            # A clock that has not been told the time yet has nothing to compare.
-            if self._clock.now_ns() > 0:
-                self._ask_if_due(_SYNC_SLOW_S if settled or hopeless else _SYNC_FAST_S)
-
-    def _ask_if_due(self, every_s: float) -> None:
-        now_s = asyncio.get_running_loop().time()
-        if now_s - self._asked_at_s < every_s:
-            return
-        self._asked_at_s = now_s
-        self._transport.write(self._codec.timesync(0, self._sync.ask(self._clock.now_ns())))
+    def _ask_for_time(self, now_ns: int) -> None:
+        self._transport.write(self._codec.timesync(0, now_ns))
 
     def _request_stream(self, message_id: int, interval_us: int) -> None:
         self._transport.write(

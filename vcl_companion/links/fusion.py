@@ -84,6 +84,10 @@ class FusionMonitor:
 
     def __init__(self) -> None:
         self.firmware = Firmware.OTHER
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin again: the autopilot has restarted."""
         self._sent: deque[_Sent] = deque(maxlen=_MAX_KEPT)
         self._believed: deque[_Believed] = deque(maxlen=_MAX_KEPT)
         self._status: EstimatorStatus | None = None
