@@ -59,6 +59,31 @@ def test_who_will_have_lost_half_when_an_update_is_there_votes_before() -> None:
     assert not any(voted([PLENTY - 50 * (k % 3 == n % 3) for k in range(n)]) for n in range(1, 40))
 
 
+@pytest.mark.parametrize(
+    ("took_s", "foreseen_s"), [(0.5, 2.0), (2.0, 2.0), (3.0, 3.0), (4.0, 4.0), (30.0, 4.0)]
+)
+def test_what_takes_longer_is_foreseen_earlier(took_s: float, foreseen_s: float) -> None:
+    """Twenty landmarks a second: 240 are left after 8 s, and that is known so long before."""
+    vote = OwnVote(OPTIONS)
+    now_s = 0.0
+
+    def look(revision: bytes, tracked: float) -> bool:
+        nonlocal now_s
+        now_s += STEP_S
+        return vote.look(revision, Sight(round(tracked)), now_s)
+
+    while not look(FIRST, FEW):
+        pass
+    for _ in range(round(took_s / STEP_S) - 1):
+        assert look(FIRST, FEW)
+    for _ in range(20):  # the vote stands until the new one has been seen for a while
+        wants = look(SECOND, PLENTY)
+    assert not wants
+    n_steps = next(k for k in range(100) if look(SECOND, PLENTY - 2.0 * k))
+    # The newest third of the window stands for where it is, and the thirds have to agree.
+    assert 8.0 - n_steps * STEP_S == pytest.approx(foreseen_s - 0.4, abs=0.3)
+
+
 def test_what_fills_less_and_less_and_what_looks_ever_newer_is_foreseen() -> None:
     def seen(sights: list[Sight]) -> bool:
         vote = OwnVote(OPTIONS)

@@ -2,7 +2,8 @@
 
 No clock and no socket: the owner says what time it is. A drone votes for an
 update when one of these holds for the median of its last second, or, of the
-first three, will hold ``ahead_s`` from now if the second goes on as it went:
+first three, will hold ``ahead_s`` from now if the second goes on as it went (or
+as long from now as the last update took, from the vote to the map):
 
 * landmarks in sight < max(``tracked``, ``share`` x most since this revision);
 * covered share of the image < min(``covered``, 0.8 x most since this revision):
@@ -40,6 +41,8 @@ _MAX_PAUSE = 8.0
 # for so long, s: a new map that is no better is found out in 0.5 s, and in fast flight the
 # next one is wanted after two.
 _SEES_MORE = 1.3
+# So many times ``ahead_s`` at most: what is further ahead is not foreseen by a second's course.
+_FURTHEST = 2.0
 _CONTENT_S = 1.0
 
 
@@ -54,7 +57,8 @@ class UpdateOptions:
         covered: share of the image that the map has to fill.
         novelty_deg: landmarks are seen from so far aside of where they are remembered, or as
             much nearer or farther (``localization.coverage``), before the map is extended.
-        ahead_s: a map is judged by what will be seen of it when an update, begun now, is there.
+        ahead_s: a map is judged by what will be seen of it when an update, begun now, is there;
+            where the last one took longer, by so much, up to twice as long.
         sigma_m: positions better than this are good enough.
         sigma_growth: above that, a drone wants an update when its position is known
             so many times worse than it was at best on this revision.
@@ -158,6 +162,8 @@ class OwnVote:
         self._most_covered = 0.0
         self._least_sigma_m = math.inf
         self._wants = False
+        self._wanted_since_s: float | None = None
+        self._took_s = 0.0
 
     def look(self, revision: bytes, sight: Sight, now_s: float) -> bool:
         """Take in what is seen now; call it several times a second.
@@ -173,6 +179,8 @@ class OwnVote:
             what was wanted may not have come of it.
         """
         if revision != self._revision:
+            if self._wanted_since_s is not None:
+                self._took_s, self._wanted_since_s = now_s - self._wanted_since_s, None
             self._revision = revision
             self._seen.clear()
             self._since_s = now_s
@@ -187,11 +195,15 @@ class OwnVote:
             self._wants = (
                 self._is_little() or self._is_narrow() or self._is_vague() or self._is_new()
             )
+        if not self._wants:
+            self._wanted_since_s = None
+        elif self._wanted_since_s is None:
+            self._wanted_since_s = now_s
         return self._wants
 
     def unseen(self) -> bool:
         """Vote while no frame has been looked at on the map in use: nobody knows what it lacks."""
-        self._wants = False
+        self._wants, self._wanted_since_s = False, None
         return False
 
     def _is_little(self) -> bool:
@@ -235,7 +247,9 @@ class OwnVote:
         steps = newest - between, between - oldest
         if steps[0] * steps[1] <= 0.0:
             return lately
-        return newest + min(steps, key=abs) * self.options.ahead_s / third_s
+        ahead_s = self.options.ahead_s
+        ahead_s = min(max(ahead_s, self._took_s), _FURTHEST * ahead_s)
+        return newest + min(steps, key=abs) * ahead_s / third_s
 
     def _is_vague(self) -> bool:
         known = [s.sigma_m for _, s in self._seen if s.sigma_m is not None]
