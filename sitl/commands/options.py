@@ -1,0 +1,51 @@
+"""What several commands may be told."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import click
+
+FOLDER = click.Path(path_type=Path)
+PIPELINES = ("default", "paper")
+
+
+def speed(_: click.Context, param: click.Parameter, value: str | None) -> float | None:
+    """Return ``max`` as infinity, else a positive number; None when it was not given."""
+    if value is None:
+        return None
+    try:
+        speed = math.inf if value == "max" else float(value)
+    except ValueError:
+        speed = math.nan
+    if not speed > 0.0:
+        raise click.BadParameter(f"{value!r} is neither a positive number nor max", param=param)
+    return speed
+
+
+parameters_option = click.option(
+    "--parameter",
+    "parameters",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Of the real --autopilot, set before it starts (repeatable).",
+)
+speed_option = click.option(
+    "--speed",
+    default="1",
+    show_default=True,
+    metavar="X|max",
+    callback=speed,
+    help="Seconds of the flight per second, or max: as fast as all daemons keep up.",
+)
+drones_option = click.option(
+    "--drones", default="", metavar="mav0,mav1", help="Only these fly; otherwise all of them."
+)
+settings_option = click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="SECTION.KEY=VALUE",
+    help="More of the daemons' configuration, the value in TOML's notation (repeatable).",
+)
