@@ -38,7 +38,7 @@ SYSTEM = 3
 PX4 = {
     "EKF2_EN": 1.0, "EKF2_EV_CTRL": 11.0, "EKF2_HGT_REF": 1.0, "EKF2_GPS_CTRL": 0.0,
     "EKF2_EV_POS_X": 0.0, "EKF2_EV_POS_Y": 0.0, "EKF2_EV_POS_Z": 0.0, "EKF2_EV_NOISE_MD": 0.0,
-    "EKF2_EVP_NOISE": 0.05, "EKF2_EV_QMIN": 0.0, "SYS_HAS_GPS": 0.0,
+    "EKF2_EVP_NOISE": 0.01, "EKF2_EV_QMIN": 0.0, "SYS_HAS_GPS": 0.0,
 }  # fmt: skip
 
 
@@ -301,7 +301,7 @@ def test_an_autopilot_that_is_not_there_is_said_in_words(tmp_path: Path) -> None
         (Firmware.PX4, PX4, "EKF2_EV_QMIN", 1.0, "prevents"),
         (Firmware.PX4, PX4, "EKF2_GPS_CTRL", 7.0, "warns"),
         (Firmware.PX4, PX4, "EKF2_EV_NOISE_MD", 1.0, "warns"),
-        (Firmware.PX4, PX4, "EKF2_EVP_NOISE", 0.5, "warns"),
+        (Firmware.PX4, PX4, "EKF2_EVP_NOISE", 0.1, "warns"),
         (Firmware.PX4, PX4, "SYS_HAS_GPS", 1.0, "warns"),
     ],
 )

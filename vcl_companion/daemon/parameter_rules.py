@@ -196,8 +196,8 @@ def _px4(*, sends_velocity: bool) -> tuple[Rule, ...]:
             "it does not look at what our poses say of their error",
         ),
         Rule(
-            ("EKF2_EVP_NOISE",), "warns", _at_most(0.1), 0.05,
-            "it takes our poses for worse than they are",
+            ("EKF2_EVP_NOISE",), "warns", _at_most(0.03), 0.01,
+            "it takes our poses for worse than they are, and errs by twice as much or more",
         ),
         Rule(
             ("SYS_HAS_GPS",), "warns", _is(0.0), 0.0,
