@@ -159,11 +159,12 @@ class MapWork:
         self, stored: StoredMap | None, lane: str, method: str, *args: object
     ) -> Any:
         """Have something done with a map, which is handed over if it is not there."""
-        try:
-            return await self._do(lane, method, *args)
-        except NotHereError:
-            await self._do(lane, "learn", stored)
-            return await self._do(lane, method, *args)
+        while True:
+            try:
+                return await self._do(lane, method, *args)
+            except NotHereError:
+                # It may have had to go again by then, for a newer one.
+                await self._do(lane, "learn", stored)
 
     async def _do(self, lane: str, method: str, *args: object) -> Any:
         process = self._process

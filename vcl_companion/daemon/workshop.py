@@ -92,6 +92,11 @@ class Workshop:
         while len(self._maps) > _N_MAPS:
             del self._maps[next(iter(self._maps))]
 
+    def _keep_only(self, revision: bytes) -> None:
+        """Let go of all maps but one: the next is made of it, and takes the others' memory."""
+        for other in [name for name in list(self._maps) if name != revision]:
+            self._maps.pop(other, None)
+
     def encode(self, image: Image, quality: int, most_bytes: int) -> bytes:
         """Return one of our frames as a host gets it, to say where it was; see ``encode_image``."""
         return encode_image(image, quality, most_bytes)
@@ -136,6 +141,7 @@ class Workshop:
     ) -> LandmarkMap | NoMap:
         """Build the next revision of a map; see ``update_map``."""
         stored = self._named(revision)
+        self._keep_only(revision)
         return update_map(stored, frames, self._options.map, self._memory, at_once=at_once)
 
     def merged(self, revision: bytes, data: bytes) -> LandmarkMap | NoMap:
@@ -144,7 +150,9 @@ class Workshop:
         Raises:
             WireError: the bytes are no map.
         """
-        built = merge_maps(self._named(revision), data, self._options.map, self._memory)
+        stored = self._named(revision)
+        self._keep_only(revision)
+        built = merge_maps(stored, data, self._options.map, self._memory)
         give_back_freed()
         return built
 
@@ -199,6 +207,7 @@ class Workshop:
         """
         options = self._options
         stored = self._named(current) if current else None
+        self._keep_only(current)
         ready = ready_map(
             offer, stored, options.detectors[0], options.pipeline.features, self._memory,
             options.tracked, held,
