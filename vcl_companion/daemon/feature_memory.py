@@ -6,6 +6,7 @@ again and again; finding their features was half of an update's time.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,6 +59,10 @@ class FeatureMemory:
         while len(self._known) > self._n_images:
             del self._known[next(iter(self._known))]
         return _unpacked(known[detector])
+
+    def keep_only(self, images: Collection[bytes]) -> None:
+        """Forget the features of all encoded images but some."""
+        self._known = {key: known for key, known in self._known.items() if key[0] in images}
 
     def pyramid(self, image_bytes: bytes, camera: Camera) -> Pyramid:
         """Return an encoded image at all resolutions.

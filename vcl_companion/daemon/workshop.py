@@ -223,6 +223,9 @@ class Workshop:
         index = with_fallbacks(
             stored.index, options.detectors[1:], options.pipeline.features, self._other_memory
         )
+        # Where the next map is asked about at all, it is mostly of the same images.
+        keyframes = index.landmark_map.keyframes
+        self._other_memory.keep_only({keyframe.image_bytes for keyframe in keyframes})
         if revision in self._maps:
             self._maps[revision] = replace(stored, index=index)
         give_back_freed()
