@@ -140,14 +140,17 @@ class MapWork:
         )
         return said
 
+    def usage(self) -> Usage:
+        """Return what the process has taken, beyond what it shares with this one."""
+        return Usage() if self._process is None else self._process.usage()
+
     def end(self) -> Usage:
         """Stop working, whatever is under way; return what the process has taken."""
         for thread in self._threads.values():
             thread.shutdown(wait=False, cancel_futures=True)
-        if self._process is None:
-            return Usage()
-        usage = self._process.usage()
-        self._process.end()
+        usage = self.usage()
+        if self._process is not None:
+            self._process.end()
         return usage
 
     def ends_with(self, exit_status: int) -> None:

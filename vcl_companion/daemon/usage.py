@@ -25,10 +25,17 @@ _CHANGED = ("Private_Dirty:", "Shared_Dirty:", "Anonymous:")
 
 @dataclass(frozen=True)
 class Usage:
-    """What a process has taken of the machine: processor time, and memory of its own at most."""
+    """What a process has taken of the machine: processor time, and memory of its own.
+
+    Attributes:
+        cpu_s: of all its threads.
+        peak_mb: the most that was resident, less what is shared with others now, MiB.
+        own_mb: what is resident now and shared with nobody, MiB.
+    """
 
     cpu_s: float = 0.0
     peak_mb: float = 0.0
+    own_mb: float = 0.0
 
 
 def cpu_s() -> float:
@@ -66,7 +73,8 @@ def usage_of(forked_pid: int) -> Usage:
         peak = kilobytes(f"{forked_pid}/status")["VmHWM:"]
         pages = kilobytes(f"{forked_pid}/smaps_rollup")
         shared = pages["Shared_Clean:"] + pages["Shared_Dirty:"]
-        return Usage(ticks / os.sysconf("SC_CLK_TCK"), (peak - shared) / 1024)
+        own = pages["Private_Clean:"] + pages["Private_Dirty:"]
+        return Usage(ticks / os.sysconf("SC_CLK_TCK"), (peak - shared) / 1024, own / 1024)
     return Usage()
 
 
