@@ -262,6 +262,8 @@ def _receive(connection: socket.socket) -> Any:
     n_memories, n_arrays, n_stream = _HEAD.unpack(head)
     lengths = _LENGTH.iter_unpack(_exactly(connection, n_memories * _LENGTH.size))
     memories = [SharedMemory(file, length) for file, (length,) in zip(files, lengths, strict=True)]
+    for memory in memories:
+        memory.touch()
     table = _exactly(connection, n_arrays * _PART.size)
     stream = _exactly(connection, n_stream)
     arrays = [
