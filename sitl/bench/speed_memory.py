@@ -19,14 +19,8 @@ from sitl.scenario import Scenario
 from vcl_companion.daemon.map_offer import MapOffer
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
-from vcl_companion.daemon.usage import (
-    forget_peak,
-    give_back_files,
-    give_back_freed,
-    kilobytes,
-    peak_resident_mb,
-    share_freed,
-)
+from vcl_companion.daemon.memory_watch import MemoryWatch
+from vcl_companion.daemon.usage import give_back_files, give_back_freed, share_freed
 from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.recording.sensor import Sensor
@@ -106,22 +100,25 @@ def _taken(data: bytes, sensor: Sensor, n_revisions: int) -> _Taken:
     gc.freeze()
     give_back_freed()
     give_back_files()
-    forget_peak()
     options = WorkOptions((), MAPPING, OPTIONS, MAPPING.detectors, InterMavOptions(), tracked=True)
     return asyncio.run(_flown(Workshop(sensor, options), decode_map(data), n_revisions))
 
 
 async def _flown(shop: Workshop, made: LandmarkMap, n_revisions: int) -> _Taken:
     work, maps = MapWork(shop, forks=True), MapStore("")
-    before, after = _resident_mb(work), list[float]()
+    watch = MemoryWatch(work.pid)
+    watching = asyncio.ensure_future(watch.run())
+    before, after = watch.now_mb(), list[float]()
     for k in range(n_revisions):
         await _replaced(work, maps, made, k)
         give_back_freed()
-        after.append(_resident_mb(work))
+        after.append(watch.now_mb())
+    watching.cancel()
+    most = watch.most_mb()
+    work.end()
     assert maps.current is not None
     assert maps.current.templates is not None
     tables = 1e-6 * table_bytes(maps.current.index, maps.current.templates)
-    most = peak_resident_mb() + work.end().peak_mb
     return _Taken(before, tuple(after), most, tables)
 
 
@@ -136,8 +133,3 @@ async def _replaced(work: MapWork, maps: MapStore, made: LandmarkMap, k: int) ->
     offer = replace(MapOffer.of(BlobKind.MAP, handed.data), update=handed.update)
     ready = await work.ready(offer, current, {})
     return maps.replace(ready.data, ready.index, ready.update, ready.templates)
-
-
-def _resident_mb(work: MapWork) -> float:
-    """Return what is resident of this process, and of the other beyond what they share, MB."""
-    return kilobytes("self/status")["VmRSS:"] / 1024 + work.usage().own_mb

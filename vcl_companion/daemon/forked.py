@@ -24,7 +24,7 @@ from typing import Any
 
 from vcl_companion.daemon.scheduling import run_before_others
 from vcl_companion.daemon.shared_arrays import PROTOCOL, SharedMemory, place_of
-from vcl_companion.daemon.usage import Usage, usage_of
+from vcl_companion.daemon.usage import cpu_s_of
 from vcl_companion.daemon.worker import Worker
 
 # Numbers of shared memories and of arrays, bytes of the stream; then the bytes of each memory;
@@ -54,14 +54,17 @@ class Forked:
             call after the other.
         realtime: whether our own ends of it go before other programs, where that is
             permitted: they hold the interpreter's lock now and then.
+
+    Attributes:
+        pid: the process's id.
     """
 
     def __init__(self, target: object, lanes: Mapping[str, int], *, realtime: bool = False) -> None:
         self._socket, other = socket.socketpair()
         sys.stdout.flush()
         sys.stderr.flush()
-        self._pid = os.fork()
-        if self._pid == 0:
+        self.pid = os.fork()
+        if self.pid == 0:
             self._socket.close()
             _serve(other, target, lanes)
         other.close()
@@ -95,9 +98,9 @@ class Forked:
             self._writer.submit(self._write, number, lane, method, args)
         return future
 
-    def usage(self) -> Usage:
-        """Return what the process has taken of the machine beyond what it shares with us."""
-        return usage_of(self._pid)
+    def cpu_s(self) -> float:
+        """Return the processor time that the process has taken so far; 0 when it is not there."""
+        return cpu_s_of(self.pid)
 
     def end(self) -> None:
         """End the process, whatever it is doing; what was asked for is lost."""
@@ -109,14 +112,14 @@ class Forked:
         until_s = time.monotonic() + _END_S
         while not self._is_over():
             if time.monotonic() >= until_s:
-                os.kill(self._pid, signal.SIGKILL)
-                os.waitpid(self._pid, 0)
+                os.kill(self.pid, signal.SIGKILL)
+                os.waitpid(self.pid, 0)
                 break
             time.sleep(_LOOK_S)
 
     def _is_over(self) -> bool:
         try:
-            return os.waitpid(self._pid, os.WNOHANG)[0] != 0
+            return os.waitpid(self.pid, os.WNOHANG)[0] != 0
         except ChildProcessError:
             return True
 

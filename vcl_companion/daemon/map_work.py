@@ -11,7 +11,6 @@ from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.forked import Forked, ProcessLostError
 from vcl_companion.daemon.map_offer import HandOut, MapOffer, ReadyMap
 from vcl_companion.daemon.map_store import StoredMap
-from vcl_companion.daemon.usage import Usage
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.daemon.workshop import NotHereError, Workshop
 from vcl_companion.geometry.rotation import Array
@@ -140,18 +139,19 @@ class MapWork:
         )
         return said
 
-    def usage(self) -> Usage:
-        """Return what the process has taken, beyond what it shares with this one."""
-        return Usage() if self._process is None else self._process.usage()
+    def pid(self) -> int | None:
+        """Return the process's id; None where there is none, or it was lost."""
+        return None if self._process is None else self._process.pid
 
-    def end(self) -> Usage:
-        """Stop working, whatever is under way; return what the process has taken."""
+    def end(self) -> float:
+        """Stop working, whatever is under way; return the process's time of a processor, s."""
         for thread in self._threads.values():
             thread.shutdown(wait=False, cancel_futures=True)
-        usage = self.usage()
-        if self._process is not None:
-            self._process.end()
-        return usage
+        if self._process is None:
+            return 0.0
+        cpu_s = self._process.cpu_s()
+        self._process.end()
+        return cpu_s
 
     def ends_with(self, exit_status: int) -> None:
         """Say what a process ends with whose threads still work; see ``Worker``."""
