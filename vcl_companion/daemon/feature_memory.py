@@ -19,9 +19,6 @@ from vcl_companion.mapping.landmark_map import Keyframe
 from vcl_companion.vision.features import Detector, FeatureOptions, Features, detect
 from vcl_companion.vision.patches import Pyramid, pyramid_of
 
-# Under a megabyte each with AKAZE and SIFT; a map has at most two dozen.
-_N_IMAGES = 40
-
 
 @dataclass(frozen=True, eq=False)
 class _Halved:
@@ -34,10 +31,11 @@ class FeatureMemory:
 
     Args:
         options: how they are found.
-        n_images: how many images are remembered.
+        n_images: how many images are remembered, under a megabyte each with AKAZE and SIFT;
+            fewer than are asked for again and again, and none of them is of use.
     """
 
-    def __init__(self, options: FeatureOptions, n_images: int = _N_IMAGES) -> None:
+    def __init__(self, options: FeatureOptions, n_images: int = 40) -> None:
         self._options = options
         self._n_images = n_images
         self._known: dict[tuple[bytes, int, int], dict[Detector, Features | _Halved]] = {}

@@ -38,6 +38,8 @@ from vcl_companion.wire.map_update import encode_map_update
 
 # The one in use, and the next one.
 _N_MAPS = 2
+# Beside a map's keyframes, the frames of a round: one of each contributor, several of who is lost.
+_N_NEW_IMAGES = 16
 # Less of a map would not tell where one is.
 _LEAST_KEYFRAMES, _LEAST_LANDMARKS = 2, 100
 
@@ -80,8 +82,9 @@ class Workshop:
         self._sensor = sensor
         self._options = options
         features = options.pipeline.features
-        self._memory = FeatureMemory(features)
-        self._other_memory = FeatureMemory(features)  # another thread's
+        n_images = options.map.max_keyframes + _N_NEW_IMAGES
+        self._memory = FeatureMemory(features, n_images)
+        self._other_memory = FeatureMemory(features, n_images)  # another thread's
         self._look = PeerLook(sensor, features, options.inter, options.detectors, options.tracked)
         self._maps: dict[bytes, StoredMap] = {}
 
@@ -93,7 +96,11 @@ class Workshop:
             del self._maps[next(iter(self._maps))]
 
     def _keep_only(self, revision: bytes) -> None:
-        """Let go of all maps but one: the next is made of it, and takes the others' memory."""
+        """Let go of all maps but one: what is about to be made takes the others' memory.
+
+        One that is named all the same is handed over once more, which costs little: its large
+        arrays are shared.
+        """
         for other in [name for name in list(self._maps) if name != revision]:
             self._maps.pop(other, None)
 
@@ -219,6 +226,7 @@ class Workshop:
     def more_indexed(self, revision: bytes) -> MapIndex:
         """Return a map's index with those by the other detectors to fall back on."""
         stored = self._named(revision)
+        self._keep_only(revision)
         options = self._options
         index = with_fallbacks(
             stored.index, options.detectors[1:], options.pipeline.features, self._other_memory
