@@ -14,6 +14,9 @@ from tests.daemon.test_companion import flying
 from tests.daemon.test_map_work import PAIR, pair, workplace
 from tests.daemon.waiting import run, until
 from vcl_companion.daemon.map_store import StoredMap
+from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.localization.intra import Localized
+from vcl_companion.localization.pipeline import ALL_EFFORT
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.wire.map_codec import revision_of
 
@@ -76,3 +79,27 @@ def test_maps_but_the_one_that_the_next_is_made_of_are_let_go_before() -> None:
     made = shop.next_revision(revision_of(PAIR), frames, at_once=False)
     assert isinstance(made, LandmarkMap)
     assert is_gone(left)
+
+
+def test_the_process_that_makes_maps_keeps_the_one_in_use_only() -> None:
+    async def scenario() -> None:
+        shop = workplace()
+        work = MapWork(shop, forks=False)
+        older = replace(pair(), revision=b"older")
+        left = weakref.ref(older)
+        shop.learn(older)
+        del older
+        stored = pair()
+        shop.learn(stored)
+        assert not is_gone(left)
+        await work.keep_only(stored)
+        assert is_gone(left)
+        # What is named all the same is handed over, and does not take the other's place.
+        other = replace(pair(), revision=b"other")
+        shot = demo.shot(2)
+        for one in (other, stored):
+            fix = await work.find(shot.image, one, None, shot.ned_from_body.rotation, ALL_EFFORT)
+            assert isinstance(fix, Localized)
+        work.end()
+
+    run(scenario())

@@ -256,7 +256,7 @@ def _receive(connection: socket.socket) -> Any:
 
     Raises:
         EOFError: the other side has hung up.
-        OSError: shared memory that came with it cannot be mapped.
+        OSError: shared memory that belongs to it has not come, or cannot be mapped.
     """
     head, files, _, _ = socket.recv_fds(connection, _HEAD.size, _MOST_MEMORIES)
     if not head:
@@ -264,6 +264,8 @@ def _receive(connection: socket.socket) -> Any:
     head += _exactly(connection, _HEAD.size - len(head))
     n_memories, n_arrays, n_stream = _HEAD.unpack(head)
     lengths = _LENGTH.iter_unpack(_exactly(connection, n_memories * _LENGTH.size))
+    if len(files) != n_memories:  # as where too many are open
+        raise OSError(f"{len(files)} of {n_memories} files of shared memory have come")
     memories = [SharedMemory(file, length) for file, (length,) in zip(files, lengths, strict=True)]
     for memory in memories:
         memory.touch()

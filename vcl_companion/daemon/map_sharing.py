@@ -360,6 +360,7 @@ class MapSharing:
         loop = asyncio.get_running_loop()
         loop.call_later(_STAYS_S, self._want_more_of, stored.revision)
         await loop.run_in_executor(self._disk, self._maps.keep, stored)
+        await self._work.keep_only(stored)
         await loop.run_in_executor(self._disk, give_back_freed)
 
     def _want_more_of(self, revision: bytes) -> None:

@@ -111,6 +111,10 @@ class MapWork:
         ready: ReadyMap = await self._do_with(current, _MAPS, "ready", offer, name, held)
         return ready
 
+    async def keep_only(self, stored: StoredMap) -> None:
+        """See ``Workshop``."""
+        await self._do(_MAPS, "keep_only", stored.revision)
+
     async def more_indexed(self, stored: StoredMap) -> MapIndex:
         """See ``Workshop``."""
         index: MapIndex = await self._do_with(stored, _PEERS, "more_indexed", stored.revision)

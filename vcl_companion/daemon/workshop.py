@@ -95,8 +95,8 @@ class Workshop:
         while len(self._maps) > _N_MAPS:
             del self._maps[next(iter(self._maps))]
 
-    def _keep_only(self, revision: bytes) -> None:
-        """Let go of all maps but one: what is about to be made takes the others' memory.
+    def keep_only(self, revision: bytes) -> None:
+        """Let go of all maps but one: the one in use, or that the next is made of.
 
         One that is named all the same is handed over once more, which costs little: its large
         arrays are shared.
@@ -148,7 +148,7 @@ class Workshop:
     ) -> LandmarkMap | NoMap:
         """Build the next revision of a map; see ``update_map``."""
         stored = self._named(revision)
-        self._keep_only(revision)
+        self.keep_only(revision)
         return update_map(stored, frames, self._options.map, self._memory, at_once=at_once)
 
     def merged(self, revision: bytes, data: bytes) -> LandmarkMap | NoMap:
@@ -158,7 +158,7 @@ class Workshop:
             WireError: the bytes are no map.
         """
         stored = self._named(revision)
-        self._keep_only(revision)
+        self.keep_only(revision)
         built = merge_maps(stored, data, self._options.map, self._memory)
         give_back_freed()
         return built
@@ -214,7 +214,7 @@ class Workshop:
         """
         options = self._options
         stored = self._named(current) if current else None
-        self._keep_only(current)
+        self.keep_only(current)
         ready = ready_map(
             offer, stored, options.detectors[0], options.pipeline.features, self._memory,
             options.tracked, held,
@@ -226,7 +226,7 @@ class Workshop:
     def more_indexed(self, revision: bytes) -> MapIndex:
         """Return a map's index with those by the other detectors to fall back on."""
         stored = self._named(revision)
-        self._keep_only(revision)
+        self.keep_only(revision)
         options = self._options
         index = with_fallbacks(
             stored.index, options.detectors[1:], options.pipeline.features, self._other_memory
