@@ -12,6 +12,7 @@ from sitl.bench.figures import Figure
 from sitl.bench.speed_extension import extension
 from sitl.bench.speed_frames import cold_start, made_ready, relocalization, shots_of, side_by_side
 from sitl.bench.speed_growth import CostTable, by_image_size, by_landmarks
+from sitl.bench.speed_memory import memory
 from sitl.bench.speed_report import write_speed
 from sitl.bench.speed_scene import Scene
 from sitl.bench.timing import Effort
@@ -19,7 +20,7 @@ from sitl.scenario import load_scenario
 
 Progress = Callable[[str, int, int], None]
 
-PARTS = ("frame", "extension", "landmarks", "images")
+PARTS = ("frame", "extension", "memory", "landmarks", "images")
 _SCENARIO = "demo"
 
 
@@ -31,6 +32,8 @@ class _Extent:
     maps: Effort
     instants: int
     rounds: int
+    map_sizes: tuple[int, ...]
+    revisions: int
     landmarks: tuple[int, ...]
     sizes_px: tuple[tuple[int, int], ...]
 
@@ -40,10 +43,21 @@ _USUAL = _Extent(
     Effort(4.0, 5, 60),
     6,
     4,
+    (1000, 4000, 12_000),
+    20,
     (200, 1000, 5000, 20_000, 100_000),
     ((320, 240), (640, 480), (1280, 800)),
 )
-_QUICK = _Extent(Effort(0.0, 2, 2), Effort(0.0, 1, 1), 1, 1, (200, 1000), ((320, 240), (480, 360)))
+_QUICK = _Extent(
+    Effort(0.0, 2, 2),
+    Effort(0.0, 1, 1),
+    1,
+    1,
+    (1000,),
+    3,
+    (200, 1000),
+    ((320, 240), (480, 360)),
+)
 
 
 @dataclass(frozen=True)
@@ -89,6 +103,8 @@ def bench_speed(out: Path, parts: tuple[str, ...], quick: bool, progress: Progre
     if "extension" in parts:
         progress("map extension", 3, 4)
         figures += extension(scene, first, shots, extent.rounds)
+    if "memory" in parts:
+        figures += memory(scenario, extent.map_sizes, extent.revisions, progress)
     if "landmarks" in parts:
         tables.append(by_landmarks(scenario, extent.landmarks, extent.maps, progress))
     if "images" in parts:

@@ -228,7 +228,7 @@ class TorturedDrone:
         for _, said in proposals + await self.exchange.inter.stragglers(asked):
             state = self.estimator.take_proposal(
                 asked.frame.captured_at_ns, asked.ned_from_body, said.world_from_body,
-                said.covariance, stored.index,
+                said.covariance, stored.index.landmark_map.points_world,
             )  # fmt: skip
             self.done[
                 f"pose of a peer: {'' if isinstance(state, FilterState) else 'not '}fused"

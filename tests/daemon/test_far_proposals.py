@@ -30,7 +30,8 @@ def after_a_fix(silent_s: float) -> tuple[Estimator, int]:
 
 def proposed(estimator: Estimator, at_ns: int, metres: float) -> FilterState | NotFused:
     there = Pose(np.eye(3), np.array([metres, 0.0, 0.0]))
-    return estimator.take_proposal(at_ns, None, there, SURE, demo.map_index(1, 2))
+    points = demo.map_index(1, 2).landmark_map.points_world
+    return estimator.take_proposal(at_ns, None, there, SURE, points)
 
 
 @pytest.mark.parametrize("silent_s", [20.0, 59.0, 90.0])

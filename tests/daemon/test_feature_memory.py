@@ -47,6 +47,15 @@ def test_the_image_that_was_asked_for_longest_ago_is_forgotten() -> None:
     assert memory.features(images[1], CAMERA, "orb") is not two
 
 
+def test_what_is_no_more_in_a_map_is_forgotten_and_the_rest_is_not() -> None:
+    memory = FeatureMemory(demo.FEATURES)
+    images = [demo.answer(system_id).image_bytes for system_id in (1, 2)]
+    one, two = (memory.features(image, CAMERA, "orb") for image in images)
+    memory.keep_only({images[0]})
+    assert memory.features(images[0], CAMERA, "orb") is one
+    assert memory.features(images[1], CAMERA, "orb") is not two
+
+
 def test_a_known_image_of_another_camera_is_as_wrong_as_an_unknown_one() -> None:
     memory = FeatureMemory(demo.FEATURES)
     memory.features(IMAGE, CAMERA, "orb")

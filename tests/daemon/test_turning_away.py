@@ -125,7 +125,8 @@ def fly(rng: np.random.Generator, peer_sees: Callable[[int], bool]) -> tuple[lis
         if sent is None and peer_sees(k):
             said = truth.retracted(PEER_SIGMA * rng.standard_normal(6))
             covariance = np.diag(PEER_SIGMA**2)
-            fused = estimator.take_proposal(at_ns, attitude, said, covariance, index)
+            points = index.landmark_map.points_world
+            fused = estimator.take_proposal(at_ns, attitude, said, covariance, points)
             sent, by = (fused, "peer") if isinstance(fused, FilterState) else (None, None)
         if sent is None:
             sent = estimator.coasted_at(at_ns)

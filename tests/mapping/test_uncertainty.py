@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -35,9 +36,9 @@ def dense_covariance(landmark_map: LandmarkMap) -> Array:
     return np.asarray(np.linalg.inv(whole[6:, 6:]))
 
 
-@pytest.mark.parametrize("n_views", [2, 3])
-def test_the_factored_covariance_is_the_dense_inverse(n_views: int) -> None:
-    scene = facade_scene(np.random.default_rng(0), 25, n_views=n_views, missed=0.1)
+@pytest.mark.parametrize(("n_views", "n_landmarks"), [(2, 25), (3, 25), (3, 600)])
+def test_the_factored_covariance_is_the_dense_inverse(n_views: int, n_landmarks: int) -> None:
+    scene = facade_scene(np.random.default_rng(0), n_landmarks, n_views=n_views, missed=0.1)
     landmark_map = map_of(scene)
     uncertainty = map_uncertainty(landmark_map)
     dense = dense_covariance(landmark_map)
@@ -175,6 +176,23 @@ def test_every_camera_model_gives_a_covariance(camera: Camera) -> None:
     scene = facade_scene(np.random.default_rng(0), 40, n_views=3, camera=camera)
     marginal = map_uncertainty(map_of(scene)).marginal()
     assert np.all(np.linalg.eigvalsh(marginal) > 0)
+
+
+def test_on_its_way_it_takes_little_more_memory_than_in_the_end() -> None:
+    landmark_map = map_of(facade_scene(np.random.default_rng(0), 6000, n_views=4))
+    tracemalloc.start()
+    try:
+        uncertainty = map_uncertainty(landmark_map)
+        kept, most = tracemalloc.get_traced_memory()
+        tracemalloc.reset_peak()
+        marginal = uncertainty.marginal()
+        more, most_more = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert kept > uncertainty.landmark_lever.nbytes
+    assert most < 1.5 * kept
+    assert more - kept > 0.9 * marginal.nbytes
+    assert most_more - kept < 3.0 * marginal.nbytes
 
 
 def degenerate_maps() -> dict[str, LandmarkMap]:

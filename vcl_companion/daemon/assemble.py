@@ -32,6 +32,7 @@ from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.local_frame import origin_in_leaders_world
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.memory_watch import MemoryWatch
 from vcl_companion.daemon.message_requests import MessageRequests
 from vcl_companion.daemon.onboard_computer import OnboardComputer
 from vcl_companion.daemon.saved_map import SavedMap
@@ -245,7 +246,8 @@ async def _run(config: Config) -> int:
         await saved.begin()  # before anybody makes a first map
         await exchange.run()
 
-    watching = [health.run(), requests.run(), parameters.run()]
+    memory = MemoryWatch(work.pid)
+    watching = [health.run(), requests.run(), parameters.run(), memory.run()]
     if config.log.status_file:
         status = StatusWriter(
             Path(config.log.status_file),
@@ -273,11 +275,12 @@ async def _run(config: Config) -> int:
             # What still runs is not waited for: an update takes seconds, and nobody wants it.
             for worker in (vision, disk):
                 worker.shutdown(wait=False, cancel_futures=True)
-            taken = work.end()
+            most_mb = memory.most_mb() or peak_resident_mb()
+            works_cpu_s = work.end()
             log.close(
-                cpu_s=cpu_s() - began_cpu_s + taken.cpu_s,
+                cpu_s=cpu_s() - began_cpu_s + works_cpu_s,
                 wall_s=time.monotonic() - began_at_s,
-                resident_mb=max(began_mb, peak_resident_mb() + taken.peak_mb),
+                resident_mb=max(began_mb, most_mb),
                 peer_bytes_sent=peers.counters.bytes_out,
                 peer_bytes_received=peers.counters.bytes_in,
                 quarantined=dict(exchange.trust.n_terms),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+import weakref
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -70,12 +71,15 @@ class _AskedPeers:
 
     Attributes:
         asked: the request.
-        stored: the map that it is about.
+        stored: the map that was flown on. Its answers come seconds later: by then it may have
+            been left, and is not to be kept in memory for them.
+        points_world: (N, 3) landmarks of it, m.
         refused: why the frame itself gave no pose; None where it did.
     """
 
     asked: Asked
-    stored: StoredMap
+    stored: weakref.ref[StoredMap]
+    points_world: Array
     refused: NotLocalized | None
 
 
@@ -140,9 +144,10 @@ class Companion:
         self._frame_wait_s = frame_wait_s
         self._mailbox = Mailbox()
         self._over = asyncio.Event()
-        self._vain: StoredMap | None = None
+        # Maps that may have been left since, which are not to be kept in memory for that.
+        self._vain: weakref.ref[StoredMap] | None = None
+        self._searched: weakref.ref[StoredMap] | None = None
         self._doubted_at_s = self._fell_back_at_s = self._search_again_at_s = -math.inf
-        self._searched: StoredMap | None = None
         self._search_over = asyncio.Event()
         self._search_over.set()
         self._sought_at_ns = -1
@@ -170,13 +175,17 @@ class Companion:
         async with asyncio.TaskGroup() as beside:
             beside.create_task(self._teller.run())
             while True:
-                frame = await self._mailbox.take()
-                stored = self._maps.current or await self._first_map(frame)
-                if stored is None:
-                    continue
-                left = await self._localize(frame, stored)
-                if left is not None:
-                    beside.create_task(self._finish(left))
+                await self._take_next(beside)
+
+    async def _take_next(self, beside: asyncio.TaskGroup) -> None:
+        """Localize the next frame; what is left to do for it is done beside those after it."""
+        frame = await self._mailbox.take()
+        stored = self._maps.current or await self._first_map(frame)
+        if stored is None:
+            return
+        left = await self._localize(frame, stored)
+        if left is not None:
+            beside.create_task(self._finish(left))
 
     async def _first_map(self, frame: Frame) -> StoredMap | None:
         """Wait for a first map as long as no newer frame comes; answer the frame if none does."""
@@ -186,17 +195,23 @@ class Companion:
             self._outcomes.refuse(frame, self._no_map())
         return self._maps.current
 
-    async def _next_map(self, frame: Frame, stored: StoredMap) -> StoredMap | None:
+    async def _next_map(self, frame: Frame, stored: StoredMap | None) -> StoredMap | None:
         """Wait for a map that may know a place which this one does not, while no frame comes.
 
         A frame that is not recognised shows where the map has a gap, and is among those that
         fill it. Where none came in time for one frame the next ones do not wait.
+
+        Args:
+            frame: which.
+            stored: the map that does not know it; None for one that has been left since.
         """
-        if stored is not self._vain and self._maps.current is stored:
+        if stored is None or self._maps.current is not stored:
+            return self._maps.current
+        if not _is(self._vain, stored):
             with self._health.waiting_for_map():
                 await self._unless_newer(frame, self._maps.newer_than(stored), self._frame_wait_s)
             if self._maps.current is stored and not self._mailbox.has_had_newer(frame):
-                self._vain = stored
+                self._vain = weakref.ref(stored)
         return None if self._maps.current is stored else self._maps.current
 
     async def _unless_newer(
@@ -245,7 +260,7 @@ class Companion:
                 await self._unless_newer(frame, self._search_over.wait())
                 if not (self._is_searching or self._mailbox.has_had_newer(frame)):
                     return await self._localize(frame, self._maps.current or stored)
-            elif stored is not self._searched or now_s >= self._search_again_at_s:
+            elif not _is(self._searched, stored) or now_s >= self._search_again_at_s:
                 self._search_over.clear()
                 self._sought_at_ns = frame.captured_at_ns
                 may_fall_back = now_s >= self._fell_back_at_s + _FALL_BACK_EVERY_S
@@ -347,7 +362,8 @@ class Companion:
         sigma_m = math.inf if refused else self._estimator.sigma_m
         asked = self._inter.begin(frame, ned_from_body, stored.revision, sigma_m)
         if asked is not None:
-            return _AskedPeers(asked, stored, refused)
+            points_world = stored.index.landmark_map.points_world
+            return _AskedPeers(asked, weakref.ref(stored), points_world, refused)
         if refused is None:
             self._outcomes.close(frame)
             return None
@@ -356,13 +372,13 @@ class Companion:
     def _searched_in_vain(self, frame: Frame, stored: StoredMap, began_at_s: float) -> None:
         """Note a search that found nothing, and whether it took longer than frames are apart."""
         ended_at_s = asyncio.get_running_loop().time()
-        self._searched = stored
+        self._searched = weakref.ref(stored)
         self._maps.want_more()
         if self._mailbox.has_had_newer(frame):
             self._search_again_at_s = ended_at_s + _PAUSE_AFTER_VAIN * (ended_at_s - began_at_s)
 
     async def _given_up(
-        self, frame: Frame, stored: StoredMap, refused: NotLocalized
+        self, frame: Frame, stored: StoredMap | None, refused: NotLocalized
     ) -> _Sought | _AskedPeers | None:
         """Answer a frame that nobody could place, unless something comes that may place it.
 
@@ -414,14 +430,14 @@ class Companion:
 
     async def _hear_peers(self, open_frame: _AskedPeers) -> None:
         """Fuse what peers say of a frame, answer it, and fuse what comes too late for that."""
-        asked, stored, refused = open_frame.asked, open_frame.stored, open_frame.refused
+        asked, refused = open_frame.asked, open_frame.refused
         state = again = None
         for host, proposal in await self._inter.ask(asked):
-            state = self._fuse(host, proposal, asked, stored) or state
+            state = self._fuse(host, proposal, open_frame) or state
         if refused is None:
             self._outcomes.close(asked.frame, None if state is None else "fused")
         elif state is None:
-            again = await self._given_up(asked.frame, stored, refused)
+            again = await self._given_up(asked.frame, open_frame.stored(), refused)
         else:
             unsent = self._send(asked.frame, state, "inter", "peer")
             if unsent is None:
@@ -430,16 +446,16 @@ class Companion:
                 self._outcomes.refuse(asked.frame, unsent)
         await self._finish(again)
         for host, proposal in await self._inter.stragglers(asked):
-            self._fuse(host, proposal, asked, stored)
+            self._fuse(host, proposal, open_frame)
 
     def _fuse(
-        self, host: int, proposal: PoseProposal, asked: Asked, stored: StoredMap
+        self, host: int, proposal: PoseProposal, open_frame: _AskedPeers
     ) -> FilterState | None:
         """Fuse a proposal at its frame's own time; return the state of that instant if taken."""
-        at_ns = asked.frame.captured_at_ns
+        at_ns = open_frame.asked.frame.captured_at_ns
         pose, covariance = proposal.world_from_body, proposal.covariance
         state = self._estimator.take_proposal(
-            at_ns, asked.ned_from_body, pose, covariance, stored.index
+            at_ns, open_frame.asked.ned_from_body, pose, covariance, open_frame.points_world
         )
         why = state.reason if isinstance(state, NotFused) else ""
         # Without a fix of our own one peer may only be said to contradict another.
@@ -484,3 +500,8 @@ class Companion:
             self._outcomes.refuse(frame, self._no_map())
         else:
             self._outcomes.drop(frame)
+
+
+def _is(noted: weakref.ref[StoredMap] | None, stored: StoredMap) -> bool:
+    """Whether a map is the one that was noted."""
+    return noted is not None and noted() is stored

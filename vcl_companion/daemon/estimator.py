@@ -20,7 +20,6 @@ from vcl_companion.localization.intra import (
     NotLocalized,
     disagreement,
 )
-from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pose_filter import (
     FilterOptions,
     FilterState,
@@ -282,7 +281,7 @@ class Estimator:
         ned_from_body: Array | None,
         world_from_body: Pose,
         covariance: Array,
-        index: MapIndex,
+        points_world: Array,
     ) -> FilterState | NotFused:
         """Take in where a peer says that we were at one of our frames.
 
@@ -291,7 +290,7 @@ class Estimator:
             ned_from_body: (3, 3) attitude of that instant, or None.
             world_from_body: the proposed pose.
             covariance: (6, 6) local, of it.
-            index: the map that the pose is in, for the distance of the scene.
+            points_world: (N, 3) landmarks of the map that the pose is in, m: how far the scene is.
 
         Returns:
             The state of that instant with the proposal in it, or why it was not taken.
@@ -314,8 +313,8 @@ class Estimator:
             self._has_begun = True
             self._history.append(state, None, ned_from_body)
             return state
-        points = index.landmark_map.points_world
-        arm_m = float(np.median(np.linalg.norm(points - world_from_body.translation, axis=1)))
+        away_m = np.linalg.norm(points_world - world_from_body.translation, axis=1)
+        arm_m = float(np.median(away_m))
         fused = self._history.fuse(at_ns, world_from_body, covariance, max(arm_m, _LEAST_ARM_M))
         if isinstance(fused, NotFused):
             return fused

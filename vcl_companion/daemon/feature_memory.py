@@ -6,6 +6,7 @@ again and again; finding their features was half of an update's time.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,9 +18,6 @@ from vcl_companion.mapping.drone_view import decode_image
 from vcl_companion.mapping.landmark_map import Keyframe
 from vcl_companion.vision.features import Detector, FeatureOptions, Features, detect
 from vcl_companion.vision.patches import Pyramid, pyramid_of
-
-# Under a megabyte each with AKAZE and SIFT; a map has at most two dozen.
-_N_IMAGES = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +31,11 @@ class FeatureMemory:
 
     Args:
         options: how they are found.
-        n_images: how many images are remembered.
+        n_images: how many images are remembered, under a megabyte each with AKAZE and SIFT;
+            fewer than are asked for again and again, and none of them is of use.
     """
 
-    def __init__(self, options: FeatureOptions, n_images: int = _N_IMAGES) -> None:
+    def __init__(self, options: FeatureOptions, n_images: int = 40) -> None:
         self._options = options
         self._n_images = n_images
         self._known: dict[tuple[bytes, int, int], dict[Detector, Features | _Halved]] = {}
@@ -58,6 +57,10 @@ class FeatureMemory:
         while len(self._known) > self._n_images:
             del self._known[next(iter(self._known))]
         return _unpacked(known[detector])
+
+    def keep_only(self, images: Collection[bytes]) -> None:
+        """Forget the features of all encoded images but some."""
+        self._known = {key: known for key, known in self._known.items() if key[0] in images}
 
     def pyramid(self, image_bytes: bytes, camera: Camera) -> Pyramid:
         """Return an encoded image at all resolutions.

@@ -23,12 +23,16 @@ from concurrent.futures import Future
 from typing import Any
 
 from vcl_companion.daemon.scheduling import run_before_others
-from vcl_companion.daemon.usage import Usage, usage_of
+from vcl_companion.daemon.shared_arrays import PROTOCOL, SharedMemory, place_of
+from vcl_companion.daemon.usage import cpu_s_of
 from vcl_companion.daemon.worker import Worker
 
-_HEAD = struct.Struct("<QQ")
-_SIZE = struct.Struct("<Q")
-_PROTOCOL = 5  # large arrays beside the stream, not in it
+# Numbers of shared memories and of arrays, bytes of the stream; then the bytes of each memory;
+# then of each array its bytes, which memory it lies in, and where there.
+_HEAD, _LENGTH, _PART = struct.Struct("<QQQ"), struct.Struct("<Q"), struct.Struct("<QQQ")
+_NOT_SHARED = (1 << 64) - 1
+# A map's arrays lie in a few; the kernel takes 253 files at a time.
+_MOST_MEMORIES = 64
 _END_S = 2.0
 _LOOK_S = 0.01
 
@@ -50,14 +54,17 @@ class Forked:
             call after the other.
         realtime: whether our own ends of it go before other programs, where that is
             permitted: they hold the interpreter's lock now and then.
+
+    Attributes:
+        pid: the process's id.
     """
 
     def __init__(self, target: object, lanes: Mapping[str, int], *, realtime: bool = False) -> None:
         self._socket, other = socket.socketpair()
         sys.stdout.flush()
         sys.stderr.flush()
-        self._pid = os.fork()
-        if self._pid == 0:
+        self.pid = os.fork()
+        if self.pid == 0:
             self._socket.close()
             _serve(other, target, lanes)
         other.close()
@@ -91,9 +98,9 @@ class Forked:
             self._writer.submit(self._write, number, lane, method, args)
         return future
 
-    def usage(self) -> Usage:
-        """Return what the process has taken of the machine beyond what it shares with us."""
-        return usage_of(self._pid)
+    def cpu_s(self) -> float:
+        """Return the processor time that the process has taken so far; 0 when it is not there."""
+        return cpu_s_of(self.pid)
 
     def end(self) -> None:
         """End the process, whatever it is doing; what was asked for is lost."""
@@ -105,14 +112,14 @@ class Forked:
         until_s = time.monotonic() + _END_S
         while not self._is_over():
             if time.monotonic() >= until_s:
-                os.kill(self._pid, signal.SIGKILL)
-                os.waitpid(self._pid, 0)
+                os.kill(self.pid, signal.SIGKILL)
+                os.waitpid(self.pid, 0)
                 break
             time.sleep(_LOOK_S)
 
     def _is_over(self) -> bool:
         try:
-            return os.waitpid(self._pid, os.WNOHANG)[0] != 0
+            return os.waitpid(self.pid, os.WNOHANG)[0] != 0
         except ChildProcessError:
             return True
 
@@ -216,14 +223,32 @@ def _portable(error: Exception) -> Exception:
 
 
 def _send(connection: socket.socket, message: object) -> None:
-    """Send a message: number of arrays, bytes of the stream, bytes of each array; then these."""
+    """Send a message: numbers and lengths; the stream; the bytes of each array that is not shared.
+
+    Of one that lies in shared memory only the place is told; the memory's file goes with the
+    first bytes.
+    """
     arrays: list[pickle.PickleBuffer] = []
-    stream = pickle.dumps(message, protocol=_PROTOCOL, buffer_callback=arrays.append)
+    stream = pickle.dumps(message, protocol=PROTOCOL, buffer_callback=arrays.append)
     parts = [array.raw() for array in arrays]
-    sizes = b"".join(_SIZE.pack(part.nbytes) for part in parts)
-    connection.sendall(_HEAD.pack(len(parts), len(stream)) + sizes + stream)
-    for part in parts:
-        connection.sendall(part)
+    places = [place_of(part) for part in parts]
+    known = {id(place.memory): place.memory for place in places if place}
+    memories = list(known.values())[:_MOST_MEMORIES]
+    number = {id(memory): n for n, memory in enumerate(memories)}
+    rows = [
+        (number.get(id(place.memory), _NOT_SHARED), place.begin) if place else (_NOT_SHARED, 0)
+        for place in places
+    ]
+    table = b"".join(_PART.pack(part.nbytes, *row) for part, row in zip(parts, rows, strict=True))
+    lengths = b"".join(_LENGTH.pack(len(memory)) for memory in memories)
+    head = _HEAD.pack(len(memories), len(parts), len(stream))
+    if memories:
+        sent = socket.send_fds(connection, [head], [memory.descriptor for memory in memories])
+        head = head[sent:]
+    connection.sendall(head + lengths + table + stream)
+    for part, (n, _) in zip(parts, rows, strict=True):
+        if n == _NOT_SHARED:
+            connection.sendall(part)
 
 
 def _receive(connection: socket.socket) -> Any:
@@ -231,11 +256,27 @@ def _receive(connection: socket.socket) -> Any:
 
     Raises:
         EOFError: the other side has hung up.
+        OSError: shared memory that belongs to it has not come, or cannot be mapped.
     """
-    n_arrays, n_stream = _HEAD.unpack(_exactly(connection, _HEAD.size))
-    sizes = _exactly(connection, n_arrays * _SIZE.size)
+    head, files, _, _ = socket.recv_fds(connection, _HEAD.size, _MOST_MEMORIES)
+    if not head:
+        raise EOFError("the other side has hung up")
+    head += _exactly(connection, _HEAD.size - len(head))
+    n_memories, n_arrays, n_stream = _HEAD.unpack(head)
+    lengths = _LENGTH.iter_unpack(_exactly(connection, n_memories * _LENGTH.size))
+    if len(files) != n_memories:  # as where too many are open
+        raise OSError(f"{len(files)} of {n_memories} files of shared memory have come")
+    memories = [SharedMemory(file, length) for file, (length,) in zip(files, lengths, strict=True)]
+    for memory in memories:
+        memory.touch()
+    table = _exactly(connection, n_arrays * _PART.size)
     stream = _exactly(connection, n_stream)
-    arrays = [_exactly(connection, size) for (size,) in _SIZE.iter_unpack(sizes)]
+    arrays = [
+        _exactly(connection, size)
+        if number == _NOT_SHARED
+        else memoryview(memories[number])[begin : begin + size]
+        for size, number, begin in _PART.iter_unpack(table)
+    ]
     return pickle.loads(stream, buffers=arrays)
 
 

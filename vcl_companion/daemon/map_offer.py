@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_store import StoredMap
+from vcl_companion.daemon.shared_arrays import shared
 from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.mapping.agreement import contradiction, have_common_keyframes, moved_to
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
@@ -103,6 +104,8 @@ def ready_map(
 ) -> ReadyMap:
     """Decode, index and cut patches; takes a second, beside the event loop and the frames.
 
+    Its large arrays lie in memory that another process can have too.
+
     Args:
         offer: what came or was made.
         current: the map in use, perhaps its parent.
@@ -129,11 +132,13 @@ def ready_map(
     else:
         data = decode_map_update(offer.blob, parent, held)
 
-    index = _indexed(decode_map(data), detector, features, memory)
+    index = shared(_indexed(decode_map(data), detector, features, memory))
     update = offer.update
     if current is not None and current.revision == offer.parent and not update:
         update = encode_map_update(data, current.index.landmark_map)
-    templates = prepare_templates(index.landmark_map, index.uncertainty) if tracked else None
+    templates = None
+    if tracked:
+        templates = shared(prepare_templates(index.landmark_map, index.uncertainty))
     contradicts = (
         "" if current is None else _contradiction(current, index.landmark_map, offer.revision)
     )
@@ -173,7 +178,7 @@ def with_fallbacks(
         except ValueError:
             continue
         fallback = replace(found, fallback=fallback)
-    return replace(index, fallback=fallback)
+    return replace(index, fallback=shared(fallback))
 
 
 def _indexed(

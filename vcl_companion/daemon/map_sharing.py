@@ -121,16 +121,18 @@ class MapSharing:
     async def _take_offers(self) -> None:
         """Look at one map after the other."""
         while True:
-            peer, offer = await self._offered.take()
-            current = self._maps.current
-            if current is not None and current.revision == offer.revision:
-                self._tell_state()  # it did not know that we have it
-                continue
-            if self._may_merge(peer, offer) and await self._merge(peer, offer):
-                continue
-            refusal = await self._taken(peer, offer)
-            if refusal is not None:
-                self._reject(peer, offer, *refusal)
+            await self._take_offer(*await self._offered.take())
+
+    async def _take_offer(self, peer: int, offer: MapOffer) -> None:
+        current = self._maps.current
+        if current is not None and current.revision == offer.revision:
+            self._tell_state()  # it did not know that we have it
+            return
+        if self._may_merge(peer, offer) and await self._merge(peer, offer):
+            return
+        refusal = await self._taken(peer, offer)
+        if refusal is not None:
+            self._reject(peer, offer, *refusal)
 
     async def _taken(self, peer: int, offer: MapOffer) -> tuple[str, str] | None:
         """Fly on a peer's map; or say what is refused, and why."""
@@ -356,16 +358,18 @@ class MapSharing:
         _log.info("map %s: %d landmarks", stored.revision.hex(), stored.n_landmarks)
         self._tell_state()
         loop = asyncio.get_running_loop()
-        loop.call_later(_STAYS_S, self._want_more_of, stored)
+        loop.call_later(_STAYS_S, self._want_more_of, stored.revision)
         await loop.run_in_executor(self._disk, self._maps.keep, stored)
+        await self._work.keep_only(stored)
         await loop.run_in_executor(self._disk, give_back_freed)
 
-    def _want_more_of(self, stored: StoredMap) -> None:
-        if not self._maps.is_in_use(stored):
+    def _want_more_of(self, revision: bytes) -> None:
+        current = self._maps.current
+        if current is None or current.revision != revision:
             return
         if self._group.wanting_update:
             # It is about to be replaced, and the next one wants the processor now.
-            asyncio.get_running_loop().call_later(_STAYS_S, self._want_more_of, stored)
+            asyncio.get_running_loop().call_later(_STAYS_S, self._want_more_of, revision)
             return
         self._maps.want_more()
 
@@ -374,14 +378,15 @@ class MapSharing:
 
         It takes as long as the map itself, and most revisions are never asked about.
         """
-        done: StoredMap | None = None
         while True:
-            stored = await self._maps.more_wanted()
-            if stored is done or not self._falls_back:
-                continue
+            await self._maps.more_wanted()
+            if self._falls_back:
+                await self._index_current()
+
+    async def _index_current(self) -> None:
+        stored = self._maps.current
+        if stored is not None and not self._maps.is_improved:
             self._maps.improve(stored, await self._work.more_indexed(stored))
-            if self._maps.is_in_use(stored):
-                done = self._maps.current
 
     def _now_s(self) -> float:
         return asyncio.get_running_loop().time()

@@ -87,6 +87,8 @@ class MapStore:
 
     def __init__(self, directory: str) -> None:
         self.current: StoredMap | None = None
+        self.is_improved = False
+        """Whether the one in use has had a better index made of it since it came."""
         self.refusal = ""
         self._directory = Path(directory) if directory else None
         self._left: deque[bytes] = deque(maxlen=_MAX_LEFT)
@@ -115,6 +117,7 @@ class MapStore:
         if self.current is not None and self.current.revision != stored.revision:
             self._left.append(self.current.revision)
         self.current = stored
+        self.is_improved = False
         self.refusal = ""
         self._decided.set()
         return stored
@@ -123,19 +126,17 @@ class MapStore:
         """Recognise a revision by a better index from the next frame on, if it is still in use."""
         if self.current is stored:
             self.current = replace(stored, index=index)
+            self.is_improved = True
             self._decided.set()
 
     def want_more(self) -> None:
         """Ask for the other detectors' indexes of the map in use: its own did not suffice."""
         self._more_wanted.set()
 
-    async def more_wanted(self) -> StoredMap:
-        """Wait until somebody asks for them; return the map in use."""
-        while True:
-            await self._more_wanted.wait()
-            self._more_wanted.clear()
-            if self.current is not None:
-                return self.current
+    async def more_wanted(self) -> None:
+        """Wait until somebody asks for them."""
+        await self._more_wanted.wait()
+        self._more_wanted.clear()
 
     def is_in_use(self, stored: StoredMap | None) -> bool:
         """Whether we fly on a revision, or, for None, on no map at all."""

@@ -11,7 +11,6 @@ from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.forked import Forked, ProcessLostError
 from vcl_companion.daemon.map_offer import HandOut, MapOffer, ReadyMap
 from vcl_companion.daemon.map_store import StoredMap
-from vcl_companion.daemon.usage import Usage
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.daemon.workshop import NotHereError, Workshop
 from vcl_companion.geometry.rotation import Array
@@ -112,6 +111,10 @@ class MapWork:
         ready: ReadyMap = await self._do_with(current, _MAPS, "ready", offer, name, held)
         return ready
 
+    async def keep_only(self, stored: StoredMap) -> None:
+        """See ``Workshop``."""
+        await self._do(_MAPS, "keep_only", stored.revision)
+
     async def more_indexed(self, stored: StoredMap) -> MapIndex:
         """See ``Workshop``."""
         index: MapIndex = await self._do_with(stored, _PEERS, "more_indexed", stored.revision)
@@ -140,15 +143,19 @@ class MapWork:
         )
         return said
 
-    def end(self) -> Usage:
-        """Stop working, whatever is under way; return what the process has taken."""
+    def pid(self) -> int | None:
+        """Return the process's id; None where there is none, or it was lost."""
+        return None if self._process is None else self._process.pid
+
+    def end(self) -> float:
+        """Stop working, whatever is under way; return the process's time of a processor, s."""
         for thread in self._threads.values():
             thread.shutdown(wait=False, cancel_futures=True)
         if self._process is None:
-            return Usage()
-        usage = self._process.usage()
+            return 0.0
+        cpu_s = self._process.cpu_s()
         self._process.end()
-        return usage
+        return cpu_s
 
     def ends_with(self, exit_status: int) -> None:
         """Say what a process ends with whose threads still work; see ``Worker``."""
@@ -159,11 +166,12 @@ class MapWork:
         self, stored: StoredMap | None, lane: str, method: str, *args: object
     ) -> Any:
         """Have something done with a map, which is handed over if it is not there."""
-        try:
-            return await self._do(lane, method, *args)
-        except NotHereError:
-            await self._do(lane, "learn", stored)
-            return await self._do(lane, method, *args)
+        while True:
+            try:
+                return await self._do(lane, method, *args)
+            except NotHereError:
+                # It may have had to go again by then, for a newer one.
+                await self._do(lane, "learn", stored)
 
     async def _do(self, lane: str, method: str, *args: object) -> Any:
         process = self._process

@@ -7,7 +7,6 @@ import os
 import resource
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 _PROC = Path("/proc")
@@ -21,14 +20,6 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # <malloc.h>
 _LARGE_BYTES, _KEPT_BYTES = 1 << 20, 4 << 20
 # Changed pages, those of relocated tables say, would come back as the file has them.
 _CHANGED = ("Private_Dirty:", "Shared_Dirty:", "Anonymous:")
-
-
-@dataclass(frozen=True)
-class Usage:
-    """What a process has taken of the machine: processor time, and memory of its own at most."""
-
-    cpu_s: float = 0.0
-    peak_mb: float = 0.0
 
 
 def cpu_s() -> float:
@@ -54,20 +45,13 @@ def forget_peak() -> None:
         (_PROC / "self/clear_refs").write_text("5", encoding="ascii")
 
 
-def usage_of(forked_pid: int) -> Usage:
-    """Return what a process forked off this one has taken, without what it shares with us now.
-
-    Zeros where the kernel does not tell, or there is no such process.
-    """
-    with suppress(OSError, ValueError, KeyError, IndexError):
+def cpu_s_of(pid: int) -> float:
+    """Return the processor time of all threads of a process so far; 0 where it is not told."""
+    with suppress(OSError, ValueError, IndexError):
         # The name may hold blanks and brackets: what follows its last bracket counts.
-        told = (_PROC / f"{forked_pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-        ticks = int(told[11]) + int(told[12])
-        peak = kilobytes(f"{forked_pid}/status")["VmHWM:"]
-        pages = kilobytes(f"{forked_pid}/smaps_rollup")
-        shared = pages["Shared_Clean:"] + pages["Shared_Dirty:"]
-        return Usage(ticks / os.sysconf("SC_CLK_TCK"), (peak - shared) / 1024)
-    return Usage()
+        told = (_PROC / f"{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+        return (int(told[11]) + int(told[12])) / os.sysconf("SC_CLK_TCK")
+    return 0.0
 
 
 def kilobytes(file: str, proc: Path = _PROC) -> dict[str, int]:

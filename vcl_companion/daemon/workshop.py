@@ -38,6 +38,8 @@ from vcl_companion.wire.map_update import encode_map_update
 
 # The one in use, and the next one.
 _N_MAPS = 2
+# Beside a map's keyframes, the frames of a round: one of each contributor, several of who is lost.
+_N_NEW_IMAGES = 16
 # Less of a map would not tell where one is.
 _LEAST_KEYFRAMES, _LEAST_LANDMARKS = 2, 100
 
@@ -80,8 +82,9 @@ class Workshop:
         self._sensor = sensor
         self._options = options
         features = options.pipeline.features
-        self._memory = FeatureMemory(features)
-        self._other_memory = FeatureMemory(features)  # another thread's
+        n_images = options.map.max_keyframes + _N_NEW_IMAGES
+        self._memory = FeatureMemory(features, n_images)
+        self._other_memory = FeatureMemory(features, n_images)  # another thread's
         self._look = PeerLook(sensor, features, options.inter, options.detectors, options.tracked)
         self._maps: dict[bytes, StoredMap] = {}
 
@@ -91,6 +94,15 @@ class Workshop:
         self._maps[stored.revision] = stored
         while len(self._maps) > _N_MAPS:
             del self._maps[next(iter(self._maps))]
+
+    def keep_only(self, revision: bytes) -> None:
+        """Let go of all maps but one: the one in use, or that the next is made of.
+
+        One that is named all the same is handed over once more, which costs little: its large
+        arrays are shared.
+        """
+        for other in [name for name in list(self._maps) if name != revision]:
+            self._maps.pop(other, None)
 
     def encode(self, image: Image, quality: int, most_bytes: int) -> bytes:
         """Return one of our frames as a host gets it, to say where it was; see ``encode_image``."""
@@ -136,6 +148,7 @@ class Workshop:
     ) -> LandmarkMap | NoMap:
         """Build the next revision of a map; see ``update_map``."""
         stored = self._named(revision)
+        self.keep_only(revision)
         return update_map(stored, frames, self._options.map, self._memory, at_once=at_once)
 
     def merged(self, revision: bytes, data: bytes) -> LandmarkMap | NoMap:
@@ -144,7 +157,9 @@ class Workshop:
         Raises:
             WireError: the bytes are no map.
         """
-        built = merge_maps(self._named(revision), data, self._options.map, self._memory)
+        stored = self._named(revision)
+        self.keep_only(revision)
+        built = merge_maps(stored, data, self._options.map, self._memory)
         give_back_freed()
         return built
 
@@ -199,6 +214,7 @@ class Workshop:
         """
         options = self._options
         stored = self._named(current) if current else None
+        self.keep_only(current)
         ready = ready_map(
             offer, stored, options.detectors[0], options.pipeline.features, self._memory,
             options.tracked, held,
@@ -210,10 +226,14 @@ class Workshop:
     def more_indexed(self, revision: bytes) -> MapIndex:
         """Return a map's index with those by the other detectors to fall back on."""
         stored = self._named(revision)
+        self.keep_only(revision)
         options = self._options
         index = with_fallbacks(
             stored.index, options.detectors[1:], options.pipeline.features, self._other_memory
         )
+        # Where the next map is asked about at all, it is mostly of the same images.
+        keyframes = index.landmark_map.keyframes
+        self._other_memory.keep_only({keyframe.image_bytes for keyframe in keyframes})
         if revision in self._maps:
             self._maps[revision] = replace(stored, index=index)
         give_back_freed()

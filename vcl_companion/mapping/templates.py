@@ -7,21 +7,21 @@ definition, and along it the map's adjustment knows better than one view.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.drone_view import decode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.surfaces import slopes_of
 from vcl_companion.mapping.uncertainty import MapUncertainty
 from vcl_companion.vision.features import Image
-from vcl_companion.vision.patches import (
-    Anchors,
-    keyframe_images,
-)
+from vcl_companion.vision.patches import Anchors, keyframe_images
 
 _HALF_PX = 4
 # A point that projects farther than this from where it was seen is a wrong one.
@@ -55,64 +55,85 @@ def prepare_templates(landmark_map: LandmarkMap, uncertainty: MapUncertainty) ->
         ValueError: an image cannot be decoded.
     """
     images = [decode_image(k.image_bytes, k.camera) for k in landmark_map.keyframes]
-    anchors, sigma = _anchored(landmark_map, uncertainty, images)
-    anchors = _inclined(anchors, sigma)
-    depth = 1.0 / anchors.planes[:, 2]
-    own = _rays_world(anchors) * (sigma * depth**2)[:, None]
-    spread = (own[:, :, None] * own[:, None, :])[:, *np.triu_indices(3)]
-    return Templates(replace(anchors, own=own, spread=spread), uncertainty)
-
-
-def _anchored(
-    landmark_map: LandmarkMap, uncertainty: MapUncertainty, images: list[Image]
-) -> tuple[Anchors, Array]:
-    """Return every landmark in every keyframe that saw it, and the sigma of its inverse depth."""
-    landmark, keyframe, planes, pixels, sigmas, texture = [], [], [], [], [], []
-    poses = []
-    for i, k in enumerate(landmark_map.keyframes):
-        world_from_cam = k.world_from_body @ k.body_from_cam
-        poses.append(world_from_cam)
-        seen = np.flatnonzero(landmark_map.seen[:, i])
-        points = world_from_cam.inverse().apply(landmark_map.points_world[seen])
-        where = k.camera.project(points)
-        margin = _HALF_PX + 2
-        size = np.array([k.camera.width_px, k.camera.height_px])
-        with np.errstate(invalid="ignore"):
-            off = np.linalg.norm(where - landmark_map.observed_px[seen, i], axis=1)
-            inside = (where >= margin).all(axis=1) & (where < size - 1 - margin).all(axis=1)
-            fits = inside & (off < max(_MAX_REPROJECTION_PX, 4.0 * landmark_map.pixel_noise_px))
-        seen, points, where = seen[fits], points[fits], where[fits]
-        z = points[:, 2]
-        ray = points / np.linalg.norm(points, axis=1)[:, None]
-        ray_world = ray @ world_from_cam.rotation.T
-        along = np.einsum(
-            "ni,nij,nj->n", ray_world, uncertainty.landmark_covariance[seen], ray_world
-        )
-        landmark.append(seen)
-        keyframe.append(np.full(len(seen), i))
-        ideal = points[:, :2] / z[:, None]
-        inverse = np.linalg.inv(k.camera.pixel_slopes(ideal)).reshape(-1, 4)
-        planes.append(np.column_stack([ideal, 1.0 / z, np.zeros((len(z), 2)), inverse]))
-        pixels.append(where)
-        sigmas.append(np.sqrt(along) * ray[:, 2] / z**2)
-        texture.append(_texture(images[i], where))
-    owner = np.concatenate(landmark).astype(np.int64)
-    order = np.argsort(owner, kind="stable")
-    n = len(landmark_map.points_world)
-    table = keyframe_images(images, poses)
+    poses = [k.world_from_body @ k.body_from_cam for k in landmark_map.keyframes]
+    views = [_anchored(landmark_map, i, pose) for i, pose in enumerate(poses)]
+    is_anchor = np.zeros(landmark_map.seen.shape, dtype=bool)
+    for i, view in enumerate(views):
+        is_anchor[view.landmarks, i] = True
+    # Those of one landmark stand together. The tables are the largest part of a map: each view
+    # writes its rows where they stay.
+    landmark, keyframe = np.nonzero(is_anchor)
+    n = len(landmark)
+    planes, pixels, texture = np.empty((n, 9)), np.empty((n, 2)), np.empty((n, 3))
+    own, spread = np.empty((n, 3)), np.empty((n, 6))
+    for i, view in enumerate(views):
+        rows = np.flatnonzero(keyframe == i)
+        if len(rows) == 0:
+            continue
+        camera = landmark_map.keyframes[i].camera
+        pixels[rows] = view.pixels
+        texture[rows] = _texture(images[i], view.pixels)
+        planes[rows], own[rows] = _planes(view, camera, poses[i], uncertainty)
+        spread[rows] = (own[rows, :, None] * own[rows, None, :])[:, *np.triu_indices(3)]
+    n_anchors = np.concatenate([[0], is_anchor.sum(axis=1)])
     anchors = Anchors(
-        first=np.searchsorted(owner[order], np.arange(n + 1)).astype(np.int64),
-        landmark=owner[order],
-        keyframe=np.concatenate(keyframe).astype(np.int64)[order],
-        planes=np.concatenate(planes)[order],
-        pixels=np.concatenate(pixels)[order],
-        points_world=landmark_map.points_world[owner[order]],
-        own=np.zeros((len(order), 3)),
-        spread=np.zeros((len(order), 6)),
-        texture=np.concatenate(texture)[order],
-        images=table,
+        first=np.cumsum(n_anchors).astype(np.int64),
+        landmark=landmark.astype(np.int64),
+        keyframe=keyframe.astype(np.int64),
+        planes=planes,
+        pixels=pixels,
+        points_world=landmark_map.points_world[landmark],
+        own=own,
+        spread=spread,
+        texture=texture,
+        images=keyframe_images(images, poses),
     )
-    return anchors, np.concatenate(sigmas)[order]
+    return Templates(anchors, uncertainty)
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """Landmarks in a keyframe: which (M,), where in camera axes (M, 3), m, and pixels (M, 2)."""
+
+    landmarks: NDArray[np.intp]
+    points_cam: Array
+    pixels: Array
+
+
+def _anchored(landmark_map: LandmarkMap, i: int, world_from_cam: Pose) -> _View:
+    """Return the landmarks that a keyframe saw, and that project to where it did."""
+    camera = landmark_map.keyframes[i].camera
+    seen = np.flatnonzero(landmark_map.seen[:, i])
+    points = world_from_cam.inverse().apply(landmark_map.points_world[seen])
+    where = camera.project(points)
+    margin = _HALF_PX + 2
+    size = np.array([camera.width_px, camera.height_px])
+    with np.errstate(invalid="ignore"):
+        off = np.linalg.norm(where - landmark_map.observed_px[seen, i], axis=1)
+        inside = (where >= margin).all(axis=1) & (where < size - 1 - margin).all(axis=1)
+        fits = inside & (off < max(_MAX_REPROJECTION_PX, 4.0 * landmark_map.pixel_noise_px))
+    return _View(seen[fits], points[fits], where[fits])
+
+
+def _planes(
+    view: _View, camera: Camera, world_from_cam: Pose, uncertainty: MapUncertainty
+) -> tuple[Array, Array]:
+    """Return the local planes (``Anchors.planes``), with slopes by neighbours in the keyframe.
+
+    And (M, 3) 1 sigma of each depth as a displacement in the world, m.
+    """
+    points, z = view.points_cam, view.points_cam[:, 2]
+    ray = points / np.linalg.norm(points, axis=1)[:, None]
+    ray_world = ray @ world_from_cam.rotation.T
+    covariance = uncertainty.landmark_covariance[view.landmarks]
+    along = np.einsum("ni,nij,nj->n", ray_world, covariance, ray_world)
+    sigma = np.sqrt(along) * ray[:, 2] / z**2
+    ideal, inverse_depth = points[:, :2] / z[:, None], 1.0 / z
+    slopes = slopes_of(view.pixels, ideal, inverse_depth, sigma)
+    lens = np.linalg.inv(camera.pixel_slopes(ideal)).reshape(-1, 4)
+    planes = np.column_stack([ideal, inverse_depth, slopes, lens])
+    per_metre = np.column_stack([ideal, np.ones(len(z))]) @ world_from_cam.rotation.T
+    return planes, per_metre * (sigma / inverse_depth**2)[:, None]
 
 
 def _texture(image: Image, pixels: Array) -> Array:
@@ -127,23 +148,3 @@ def _texture(image: Image, pixels: Array) -> Array:
             for product in (gx * gx, gx * gy, gy * gy)
         ]
     ).astype(np.float64)
-
-
-def _rays_world(anchors: Anchors) -> Array:
-    """Return (A, 3) displacement in the world per metre of depth."""
-    rotations = np.stack([p.rotation for p in anchors.images.worlds_from_cams])
-    rays = np.column_stack([anchors.planes[:, :2], np.ones(len(anchors.planes))])
-    return np.asarray(np.einsum("aij,aj->ai", rotations[anchors.keyframe], rays))
-
-
-def _inclined(anchors: Anchors, sigma: Array) -> Anchors:
-    """Return the anchors with the plane that their neighbours in the same keyframe lie on."""
-    planes = anchors.planes.copy()
-    for i in range(len(anchors.images.worlds_from_cams)):
-        rows = np.flatnonzero(anchors.keyframe == i)
-        if len(rows) == 0:
-            continue
-        planes[rows, 3:5] = slopes_of(
-            anchors.pixels[rows], planes[rows, :2], planes[rows, 2], sigma[rows]
-        )
-    return replace(anchors, planes=planes)

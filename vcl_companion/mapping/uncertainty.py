@@ -9,6 +9,7 @@ average out over landmarks or frames and is what fusing must not forget.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +35,9 @@ _GROWTH = 1.5
 _WIDER = 1.5
 # No distance between drones is known better; much smaller sigmas overflow.
 _FINEST_M = 1e-6
+# So many landmarks are dealt with at a time: on its way what is known of one takes ten times the
+# memory that it takes in the end.
+_AT_A_TIME = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +56,7 @@ class MapUncertainty:
 
     def marginal(self) -> Array:
         """Return (N, 3, 3) the whole covariance of each landmark, m^2."""
-        return self._with_shared(slice(None), 1.0)
+        return self._with_shared(np.arange(len(self.landmark_lever)), 1.0)
 
     def for_matching(self, landmarks: NDArray[np.intp]) -> Array:
         """Return (M, 3, 3) covariances that tell sightings of some landmarks from wrong ones.
@@ -62,10 +66,18 @@ class MapUncertainty:
         """
         return self._with_shared(landmarks, _WIDER)
 
-    def _with_shared(self, landmarks: NDArray[np.intp] | slice, factor: float) -> Array:
-        lever = self.landmark_lever[landmarks]
-        shared = factor**2 * lever @ self.keyframe_covariance
-        return np.asarray(self.landmark_covariance[landmarks] + shared @ np.swapaxes(lever, 1, 2))
+    def _with_shared(self, landmarks: NDArray[np.intp], factor: float) -> Array:
+        out = self.landmark_covariance[landmarks]
+        for some in _portions(len(landmarks)):
+            lever = self.landmark_lever[landmarks[some]]
+            shared = factor**2 * lever @ self.keyframe_covariance
+            out[some] += shared @ np.swapaxes(lever, 1, 2)
+        return out
+
+
+def _portions(n: int) -> Iterator[slice]:
+    for begin in range(0, n, _AT_A_TIME):
+        yield slice(begin, min(begin + _AT_A_TIME, n))
 
 
 def views_of(landmark_map: LandmarkMap) -> Views:
@@ -97,25 +109,40 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
     if not all(distance.sigma_m >= _FINEST_M for distance in landmark_map.distances):
         raise ValueError("the map claims to know a distance exactly")
     # A map may come from a peer: whatever its numbers are, they only fail the tests below.
+    n, n_keyframes = len(landmark_map.points_world), len(landmark_map.keyframes)
+    inverse = np.empty((n, 3, 3))
+    # In the order in which compiled loops were compiled for it. It is the largest part of a
+    # map of many keyframes, and a millionth of it is no matter.
+    lever = np.empty((n, 3, 6 * n_keyframes), dtype=np.float32)
+    reduced = np.zeros((6 * n_keyframes, 6 * n_keyframes))
     with np.errstate(all="ignore"):
-        views = views_of(landmark_map)
         # Distances enter in units of their own sigma; pixels in px: bring both to sigmas.
         noise_px = _noise_px(landmark_map)[:, None, None]
-        scaled = replace(views, slopes=views.slopes / noise_px)
-        system = normal_equations(scaled, None)
-        inverse = _inverse(system.point_block)
-        # In the order in which compiled loops were compiled for it. It is the largest part of a
-        # map of many keyframes, and a millionth of it is no matter.
-        lever = np.ascontiguousarray(-np.swapaxes(system.cross @ inverse, 1, 2), dtype=np.float32)
-        reduced = system.pose_block - eliminated(system.cross, inverse, system.seen)
+        for some in _portions(n):
+            views = views_of(_of(landmark_map, some))
+            scaled = replace(views, slopes=views.slopes / noise_px)
+            system = normal_equations(scaled, None)
+            inverse[some] = _inverse(system.point_block)
+            lever[some] = -np.swapaxes(system.cross @ inverse[some], 1, 2)
+            reduced += system.pose_block - eliminated(system.cross, inverse[some], system.seen)
         covariance = np.zeros_like(reduced)
         covariance[6:, 6:] = _inverse(reduced[6:, 6:])
         if landmark_map.anchor_covariance.any():
             # Whatever the first keyframe is off by, all are, and so are the landmarks.
-            first = landmark_map.keyframes[0].world_from_body
-            alike = np.vstack([adjoint(body.inverse() @ first) for body in views.bodies])
+            bodies = [keyframe.world_from_body for keyframe in landmark_map.keyframes]
+            alike = np.vstack([adjoint(body.inverse() @ bodies[0]) for body in bodies])
             covariance += alike @ landmark_map.anchor_covariance @ alike.T
     return MapUncertainty(covariance, inverse, lever)
+
+
+def _of(landmark_map: LandmarkMap, some: slice) -> LandmarkMap:
+    """Return some landmarks of a map, the distances with the first of them only."""
+    return replace(
+        landmark_map,
+        points_world=landmark_map.points_world[some],
+        observed_px=landmark_map.observed_px[some],
+        distances=landmark_map.distances if some.start == 0 else (),
+    )
 
 
 def _noise_px(landmark_map: LandmarkMap) -> Array:

@@ -124,12 +124,15 @@ def adjust(views: Views, options: BundleOptions) -> tuple[Views, float]:
                 views, cost, damping = candidate, new_cost, max(damping / 5.0, 1e-9)
                 if converged:
                     break
+                del system  # of a large map as much as the map, and the next is as large
                 system = problem.system(views, damping)
                 continue
         damping *= 6.0
         if damping > 1e8:
             break
+        del system
         system = problem.system(views, damping)
+    del system
     return views, residual_noise_px(reprojection_residuals(views))
 
 
