@@ -60,7 +60,9 @@ def test_a_peer_s_word_is_not_judged_by_a_heading_that_is_none() -> None:
     said = about_down(NORTH_RAD) @ BODY
     for has_heading in (True, False):
         mine = estimator(has_heading=has_heading)
-        taken = mine.take_proposal(0, said, Pose(BODY, np.zeros(3)), SURE, demo.map_index(1, 2))
+        taken = mine.take_proposal(
+            0, said, Pose(BODY, np.zeros(3)), SURE, demo.map_index(1, 2).landmark_map.points_world
+        )
         if has_heading:
             assert isinstance(taken, NotFused)
             assert "heading" in taken.reason
@@ -69,7 +71,7 @@ def test_a_peer_s_word_is_not_judged_by_a_heading_that_is_none() -> None:
             assert heading_of(taken.world_from_ned.T) == pytest.approx(NORTH_RAD, abs=1e-6)
         tilted = Pose(BODY @ exp_so3(np.array([0.4, 0.0, 0.0])), np.zeros(3))
         refused = estimator(has_heading=has_heading).take_proposal(
-            0, said, tilted, SURE, demo.map_index(1, 2)
+            0, said, tilted, SURE, demo.map_index(1, 2).landmark_map.points_world
         )
         assert isinstance(refused, NotFused)
         assert "roll and pitch" in refused.reason
