@@ -455,7 +455,11 @@ class AutopilotLink:
                 self._tally.refuse("attitude overtaken by a later one")
             case "turned":
                 degrees = math.degrees(history.north_rad)
-                _log.info("the autopilot has turned its north, by %.1f degrees so far", degrees)
+                if self._first_reset is None:
+                    history.take_its_north()
+                    _log.info("the autopilot has found its north, by %.1f degrees", degrees)
+                else:
+                    _log.info("the autopilot has turned its north, by %.1f degrees so far", degrees)
             case "rebooted":
                 _log.warning("the autopilot has restarted")
                 self._sync.reset()
