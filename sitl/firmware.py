@@ -41,6 +41,11 @@ class FirmwareBinary:
         """Whether its height counts from where it was switched on, by a barometer."""
         return self.kind == "px4" and dict(self.parameters).get("EKF2_HGT_REF") != _HEIGHT_BY_VISION
 
+    @property
+    def holds_at_rest(self) -> bool:
+        """Whether it says that it holds its position for constant while it stands and fuses too."""
+        return self.kind == "px4"
+
     def __str__(self) -> str:
         return f"{self.kind}={self.path}"
 

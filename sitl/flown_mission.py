@@ -1,7 +1,8 @@
 """How well a drone flew its mission: its true path against the one that it was commanded.
 
 Commands are places in the firmware's local frame, which is the ``world`` of our poses; the
-leader's start carries them to the truth, as it does everything.
+leader's start carries them to the truth, as it does everything. Where the firmware's height is a
+barometer's, that counts from where the drone stood.
 """
 
 from __future__ import annotations
@@ -51,7 +52,11 @@ class FlownMission:
 
 
 def read_mission(
-    folder: Path, truth: Trajectory | None, ref_from_world: Pose | None
+    folder: Path,
+    truth: Trajectory | None,
+    ref_from_world: Pose | None,
+    *,
+    has_own_height: bool = False,
 ) -> FlownMission | None:
     """Judge how a mission was flown; None where there was none, or it never began.
 
@@ -59,6 +64,7 @@ def read_mission(
         folder: the drone's.
         truth: of the flight.
         ref_from_world: by the leader's start.
+        has_own_height: whether its height counts from elsewhere: then from where it stood.
 
     Raises:
         FlightError: the file is broken.
@@ -76,6 +82,9 @@ def read_mission(
     if len(lines) < 3:
         return None
     corners = ref_from_world.apply(places)
+    if has_own_height:
+        stood = int(np.searchsorted(truth.at_ns, at_ns[0]).clip(max=len(truth.at_ns) - 1))
+        corners[:, 2] += truth.positions_m[stood, 2] - corners[0, 2]
     ends_ns = min(int(at_ns[-1]), int(truth.at_ns[-1]))
     during = (truth.at_ns >= at_ns[0]) & (truth.at_ns <= ends_ns)
     true = truth.positions_m[during]

@@ -66,6 +66,7 @@ def read_fused(
     ref_from_world: Pose | None,
     *,
     has_own_height: bool = False,
+    holds_at_rest: bool = False,
 ) -> Fused | None:
     """Judge what a firmware has written of itself; None where there was none, or no truth.
 
@@ -75,6 +76,7 @@ def read_fused(
         truth: the recording's.
         ref_from_world: by the leader's start.
         has_own_height: whether its height counts from elsewhere.
+        holds_at_rest: whether it calls a position that it has constant while it stands.
 
     Raises:
         FlightError: a file is broken.
@@ -84,7 +86,7 @@ def read_fused(
         return None
     try:
         at_ns, positions = _read_positions(path)
-        spans = _fused_spans(folder / SAID_FILE)
+        spans = _fused_spans(folder / SAID_FILE, 0 if holds_at_rest else _CONSTANT_POSITION)
     except (OSError, ValueError) as broken:
         raise FlightError(f"{path}: {broken}") from broken
     begins_ns, ends_ns = int(sent.at_ns[0]), int(truth.at_ns[-1])
@@ -133,8 +135,8 @@ def _read_positions(path: Path) -> tuple[NDArray[np.int64], Array]:
     return np.array(times, dtype=np.int64), np.array(rows, dtype=np.float64).reshape(-1, 3)
 
 
-def _fused_spans(path: Path) -> list[tuple[int, int]]:
-    """Return when a firmware said that it had a position, from and to, ns."""
+def _fused_spans(path: Path, unless: int) -> list[tuple[int, int]]:
+    """Return when a firmware said that it had a position, and no flag against it; from, to, ns."""
     spans: list[tuple[int, int]] = []
     since_ns: int | None = None
     for line in path.read_text(encoding="utf-8").splitlines()[1:]:
@@ -142,7 +144,7 @@ def _fused_spans(path: Path) -> list[tuple[int, int]]:
         if not text.startswith(_FLAGS):
             continue
         flags = int(text.removeprefix(_FLAGS).rstrip('"'), 16)
-        has_it = bool(flags & _POSITION) and not flags & _CONSTANT_POSITION
+        has_it = bool(flags & _POSITION) and not flags & unless
         if has_it and since_ns is None:
             since_ns = int(at_text)
         elif not has_it and since_ns is not None:

@@ -1,4 +1,4 @@
-"""A live flight: the firmware's own model flies, and its cameras see what is rendered.
+"""A live flight: a model flies as its firmware commands, and its cameras see what is rendered.
 
 Time stands still while images are rendered: the daemons have as much of the machine as in a
 recorded flight at the same speed, and more meanwhile. What was seen is left as a recording that
@@ -109,10 +109,6 @@ def plan_live(scenario: Scenario, out: Path, options: FlyOptions) -> FlightPlan:
     """
     if options.firmware is None:
         raise ConfigError("a live flight takes a real --autopilot: the stand-in does not fly")
-    if options.firmware.kind != "ardupilot":
-        raise ConfigError(
-            "a live flight takes --autopilot ardupilot=FILE: PX4 flies recordings alone"
-        )
     missions = {}
     drones = []
     for drone in scenario.drone:

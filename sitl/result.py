@@ -17,6 +17,7 @@ from sitl.evaluation import (
     ref_from_world,
     scores,
 )
+from sitl.firmware import FirmwareBinary
 from sitl.flight_log import FlightLog, MapRow, PropagatedRow, estimates_of, read_received
 from sitl.flown_mission import FlownMission, read_mission
 from sitl.fused import Fused, read_fused
@@ -179,7 +180,7 @@ def gather(plan: FlightPlan, out: Path, events: Iterable[Event] = ()) -> FlightR
             logs[d.name],
             alignment,
             lives.get(d.name),
-            has_own_height=firmware is not None and firmware.has_own_height,
+            firmware,
         )
         for d in plan.drones
     )
@@ -213,8 +214,7 @@ def _drone_result(
     log: FlightLog,
     alignment: Pose | None,
     lives: Lives | None,
-    *,
-    has_own_height: bool,
+    firmware: FirmwareBinary | None,
 ) -> DroneResult:
     errors = None
     every = range(len(planned.drone.frames))
@@ -222,6 +222,7 @@ def _drone_result(
         true = tuple(truth[n] if n >= 0 else None for n in frame_of.tolist())
         errors = pose_errors(estimates, true, alignment)
     axes = NED_FROM_REFERENCE[planned.drone.sensor.reference_axes].T
+    has_own_height = firmware is not None and firmware.has_own_height
     return DroneResult(
         name=planned.name,
         frames_at_ns=planned.frames_at_ns,
@@ -240,8 +241,11 @@ def _drone_result(
             planned.drone.truth,
             alignment,
             has_own_height=has_own_height,
+            holds_at_rest=firmware is not None and firmware.holds_at_rest,
         ),
-        mission=read_mission(out / planned.name, planned.drone.truth, alignment),
+        mission=read_mission(
+            out / planned.name, planned.drone.truth, alignment, has_own_height=has_own_height
+        ),
         given=np.array(every if lives is None else lives.frames, dtype=np.int64),
         lives=() if lives is None else tuple(lives.lives),
     )

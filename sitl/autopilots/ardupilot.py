@@ -127,7 +127,7 @@ def main(arguments: list[str]) -> int:
             own = of_a_mission(options.flies.mission.speed_m_s)
         return options.over(own)
 
-    return run_flown("ardupilot", arguments, read, start)
+    return run_flown("ardupilot", arguments, read, start, has_fixed_ports=True)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from contextlib import ExitStack
 
 import numpy as np
 
+from sitl.autopilots.ardupilot_pilot import ArduCopterPilot
 from sitl.autopilots.ardupilot_process import ArduCopterProcess
 from sitl.autopilots.firmware_options import FirmwareOptions
 from sitl.autopilots.wire import Wire
@@ -40,6 +41,8 @@ class ArduCopterQuad(ArduCopterProcess):
         wire: where it talks to.
         stack: ends the process.
     """
+
+    pilot = ArduCopterPilot
 
     def __init__(
         self, options: FirmwareOptions, mission: Mission, wire: Wire, stack: ExitStack

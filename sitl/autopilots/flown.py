@@ -64,7 +64,13 @@ class Firmware(Protocol):
 
 @runtime_checkable
 class FlyingFirmware(Firmware, Protocol):
-    """One that flies by its own physics."""
+    """One that flies by its own physics.
+
+    Attributes:
+        pilot: who can command it.
+    """
+
+    pilot: type[Pilot]
 
     def ned_from_body(self, at_ns: int) -> Pose:
         """Return where it truly is at an instant of its last step."""
@@ -100,8 +106,10 @@ class Flown:
         self._ground = dialect.MAVLink(None, _GROUND_SYSTEM, _GROUND_COMPONENT)
         self._as_firmware = dialect.MAVLink(None, options.system_id, 1)
         self._pilot: Pilot | None = None
-        if isinstance(options.flies, Orders):
-            self._pilot = Pilot(options.flies, options.system_id, self._command, options.out, stack)
+        if isinstance(options.flies, Orders) and isinstance(self._firmware, FlyingFirmware):
+            self._pilot = self._firmware.pilot(
+                options.flies, options.system_id, self._command, options.out, stack
+            )
         self._companion: tuple[str, int] | None = None
         self._backlog = Backlog()
         # What the companion has sent, and when that arrives.
@@ -223,7 +231,12 @@ class Flown:
 
 
 def run_flown(
-    name: str, arguments: list[str], read: Callable[[Path], FirmwareOptions], start: Start
+    name: str,
+    arguments: list[str],
+    read: Callable[[Path], FirmwareOptions],
+    start: Start,
+    *,
+    has_fixed_ports: bool = False,
 ) -> int:
     """Serve from the command line until told to finish, or until stdin ends; return the exit code.
 
@@ -232,14 +245,15 @@ def run_flown(
         arguments: of the command line.
         read: reads its configuration.
         start: starts the firmware.
+        has_fixed_ports: whether one that flies by itself takes ports that are always the same.
     """
 
     def run(path: Path) -> None:
         options = read(path)
         with ExitStack() as stack:
             udp = stack.enter_context(open_udp())
-            if isinstance(options.flies, Orders):
-                # Its ports are always the same; the companion's socket stays where it is.
+            if has_fixed_ports and isinstance(options.flies, Orders):
+                # The companion's socket stays where it is.
                 enter_own_network()
             autopilot = Flown(options, start, udp, stack)
             serve(autopilot, udp, autopilot.wire.socket)

@@ -30,6 +30,8 @@ _SHAKES_HZ, _SHAKEN_M_S2, _SHAKEN_RAD_S = 60.0, 2.0, 0.05
 _PHASES_RAD = np.array([0.0, 2.0, 4.0])
 # Bits of fields_updated: acceleration and rates; field; pressure, its altitude, temperature.
 _INERTIAL, _FIELD, _PRESSURE = 0b111111, 0b111 << 6, 0b1101 << 9
+PERIOD_US = 4000
+"""Of the inertial unit; the others speak at each so manieth of its readings."""
 _FIELD_EVERY, _PRESSURE_EVERY = 4, 5
 
 
@@ -53,7 +55,7 @@ def hil_sensors(
 
     Args:
         motion: at T instants.
-        since_us: (T,) of them by the autopilot's clock, us.
+        since_us: (T,) of them by the autopilot's clock, us: multiples of ``PERIOD_US``.
         shaken: (T,) whether the propellers turn.
         rng: of the noise.
     """
@@ -63,8 +65,9 @@ def hil_sensors(
     messages = []
     for k, at_us in enumerate(since_us.tolist()):
         updated = _INERTIAL
-        updated |= _FIELD if k % _FIELD_EVERY == 0 else 0
-        updated |= _PRESSURE if k % _PRESSURE_EVERY == 0 else 0
+        number = at_us // PERIOD_US
+        updated |= _FIELD if number % _FIELD_EVERY == 0 else 0
+        updated |= _PRESSURE if number % _PRESSURE_EVERY == 0 else 0
         messages.append(
             dialect.MAVLink_hil_sensor_message(
                 at_us, *read.forces[k], *read.rates[k], *read.fields[k],

@@ -196,9 +196,9 @@ def fly(
 @click.option("--out", required=True, metavar="DIR", type=FOLDER, help="Results; made if absent.")
 @click.option(
     "--autopilot",
-    metavar="ardupilot=FILE",
+    metavar="ardupilot=FILE|px4=FOLDER",
     required=True,
-    help="A real firmware built for simulation: its own model flies.",
+    help="A real firmware built for simulation.",
 )
 @parameters_option
 @speed_option
@@ -231,9 +231,9 @@ def live(
 ) -> None:
     """Fly the missions of SCENARIO without GPS (a TOML file, or the name of an embedded one).
 
-    The firmware's own model of a quad flies, what its camera sees is rendered, and its estimator
-    has nothing but our poses. Leaves what a flight leaves, and DIR/recording, to be flown again.
-    Exit status: 0, 2 for input that cannot be used, 1 when a process ended.
+    A model of a quad flies as the firmware commands, what its camera sees is rendered, and its
+    estimator has nothing but our poses. Leaves what a flight leaves, and DIR/recording, to be
+    flown again. Exit status: 0, 2 for input that cannot be used, 1 when a process ended.
     """
     from rich.console import Console
 

@@ -152,6 +152,23 @@ def test_an_autopilot_that_turns_its_north_does_not_turn_the_drone() -> None:
         assert angle(attitude.ned_from_body, true_at(at_ns)) < np.deg2rad(0.1)
 
 
+def test_one_that_has_found_its_north_tells_in_that_from_then_on() -> None:
+    times = list(range(1000 * MS, 2020 * MS, 20 * MS))
+    ours = flown(times, 2000 * MS)
+    ours.take_its_north()
+    assert ours.north_rad == 0.0
+    assert ours.at(1900 * MS + OFFSET_NS, OFFSET_NS) is None
+    found = exp_so3(np.array([0.0, 0.0, NORTH_RAD]))
+    for boot_ns in range(2020 * MS, 2200 * MS, 20 * MS):
+        one = sample(boot_ns)
+        turned = found @ one.ned_from_body
+        assert ours.add(AttitudeSample(1, 1, one.time_boot_ms, turned, "quaternion"), 0) == "taken"
+    for at_ns in (2001 * MS, 2103 * MS):
+        attitude = ours.at(at_ns + OFFSET_NS + MS // 2, OFFSET_NS)
+        assert attitude is not None
+        assert angle(attitude.ned_from_body, found @ true_at(at_ns)) < np.deg2rad(0.1)
+
+
 def test_noise_and_lost_samples_are_no_turn_of_the_north() -> None:
     rng = np.random.default_rng(3)
     times = [t for t in range(1000 * MS, 5000 * MS, 20 * MS) if rng.random() > 0.3]

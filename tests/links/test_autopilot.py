@@ -154,6 +154,27 @@ def test_attitude_that_does_not_come_is_the_last_or_none() -> None:
     asyncio.run(scenario())
 
 
+@pytest.mark.parametrize(("is_told", "expected_deg"), [(False, 50.0), (True, 10.0)])
+def test_a_north_that_is_found_before_our_first_pose_is_its_own(
+    is_told: bool, expected_deg: float
+) -> None:
+    async def scenario() -> None:
+        async with linked(ManualClock(NOW_NS)) as (link, autopilot):
+            await autopilot.answer_question()
+            for k in range(5):
+                autopilot.measure(NOW_NS + k * 20 * MS, turned(10.0))
+            assert await link.attitudes.at(NOW_NS + 80 * MS, 5.0) is not None
+            if is_told:
+                assert link.poses.send(at_rest(Pose.identity(), np.eye(6))) is None
+            for k in range(5, 10):
+                autopilot.measure(NOW_NS + k * 20 * MS, turned(50.0))
+            attitude = await link.attitudes.at(NOW_NS + 180 * MS, 5.0)
+            assert attitude is not None
+            assert degrees_off(attitude.ned_from_body, turned(expected_deg)) < 0.6
+
+    asyncio.run(scenario())
+
+
 def test_quaternions_are_preferred_to_angles() -> None:
     async def scenario() -> None:
         async with linked(ManualClock(NOW_NS)) as (link, autopilot):

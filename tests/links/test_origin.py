@@ -220,7 +220,7 @@ def test_with_height_by_vision_a_px4_is_told_none() -> None:
             await passes_until(lambda: len(vehicle.texts) >= 2)
             await passes(30.0)
             text = "".join(vehicle.texts)
-            assert text == "VCL no origin is set: with EKF2_HGT_REF 3 it would climb away; set 1"
+            assert text == "VCL no origin is set: with EKF2_HGT_REF 3 it would climb away; set 0"
             assert vehicle.told == []
 
     run(scenario())

@@ -18,6 +18,7 @@ from sitl.autopilots.ardupilot_parameters import RECORDED
 from sitl.autopilots.firmware_options import FirmwareOptions
 from sitl.autopilots.flown import Flown, Start
 from sitl.autopilots.motion import RecordedMotion
+from sitl.autopilots.px4_parameters import RECORDED as PX4_RECORDED
 from sitl.autopilots.steered import open_udp
 from sitl.firmware import parse_firmware
 from vcl_companion.clock import ManualClock
@@ -63,7 +64,7 @@ ARDUPILOT = Real(
     has_own_height=False,
 )
 # By the first pose it has our clock.
-PX4 = Real("px4", px4.Px4, px4.PARAMETERS, "VCL_PX4", 60_000_000_000, has_own_height=True)
+PX4 = Real("px4", px4.start, PX4_RECORDED, "VCL_PX4", 60_000_000_000, has_own_height=True)
 
 
 SYSTEM = 2

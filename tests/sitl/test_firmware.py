@@ -199,6 +199,21 @@ def test_what_a_firmware_was_never_sent_it_has_not_fused(tmp_path: Path) -> None
     assert np.isclose(some.fused_share, 3.0 / 9.9)
 
 
+def test_a_px4_that_stands_calls_the_position_that_it_has_constant(tmp_path: Path) -> None:
+    at_ns = np.arange(0, 10_000_000_000, 100_000_000, dtype=np.int64)
+    still = Trajectory(at_ns, np.zeros((100, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (100, 1)))
+    sent = Estimates(at_ns, (Pose.identity(),) * 100, np.zeros((100, 6, 6)))
+    (tmp_path / "fused.csv").write_text("at_ns,x,y,z\n" + "".join(f"{t},1,0,0\n" for t in at_ns))
+    (tmp_path / "said.csv").write_text(
+        'at_ns,severity,text\n0,6,"estimator flags 0xa5"\n1000000000,6,"estimator flags 0x1af"\n'
+        '8000000000,6,"estimator flags 0x13f"\n'
+    )
+    for holds_at_rest, after_s in ((True, 1.0), (False, 8.0)):
+        found = read_fused(tmp_path, sent, still, Pose.identity(), holds_at_rest=holds_at_rest)
+        assert found is not None
+        assert found.fused_after_s == after_s
+
+
 def test_a_height_that_counts_from_elsewhere_is_judged_by_how_it_goes(tmp_path: Path) -> None:
     at_ns = np.arange(0, 10_000_000_000, 100_000_000, dtype=np.int64)
     still = Trajectory(at_ns, np.zeros((100, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (100, 1)))
@@ -219,5 +234,6 @@ def test_a_height_that_counts_from_elsewhere_is_judged_by_how_it_goes(tmp_path: 
 
 def test_px4_s_height_is_its_own_unless_vision_gives_it(build: Path) -> None:
     assert parse_firmware(f"px4={build}").has_own_height
+    assert parse_firmware(f"px4={build}").holds_at_rest
     assert not parse_firmware(f"px4={build}", ("EKF2_HGT_REF=3",)).has_own_height
     assert not parse_firmware(f"ardupilot={build / 'bin' / 'px4'}").has_own_height

@@ -71,3 +71,14 @@ def test_each_sensor_speaks_at_its_own_rate_and_never_says_the_same_twice() -> N
     assert len({one["xmag"] for one in said}) > 0.99 * N
     assert said == readings(still(0.0, Rotation.identity()))
     assert said != readings(still(0.0, Rotation.identity()), seed=1)
+
+
+def test_readings_one_by_one_come_at_the_same_rates() -> None:
+    whole = [int(one["fields_updated"]) for one in readings(still(0.0, Rotation.identity()))]
+    stands = RecordedMotion(np.array([0, 1]), np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+    rng = np.random.default_rng(0)
+    single = [
+        hil_sensors(stands.at(np.array([0])), np.array([at_us]), np.array([False]), rng)[0]
+        for at_us in range(4000, 4000 * 41, 4000)
+    ]
+    assert [one.fields_updated for one in single] == whole[:40]

@@ -135,3 +135,21 @@ def test_a_drone_has_a_flight_or_a_mission_and_not_both(tmp_path: Path) -> None:
     path.write_text('name = "none"\n[[drone]]\nname = "mav0"\n')
     with pytest.raises(ConfigError, match="either a flight or a mission"):
         load_scenario(path)
+
+
+def test_where_height_is_a_barometer_s_a_path_counts_from_where_it_stood(tmp_path: Path) -> None:
+    commanded(tmp_path, [(t, (x, y, z + 7.5), what) for t, (x, y, z), what in ORDERS])
+    flew = truth(
+        [
+            (10.0, (0.0, 0.0, 0.0)),
+            (17.0, (5.0, 0.0, -2.8)),  # 0.2 m too low
+            (20.0, (10.0, 0.0, -3.0)),
+            (24.0, (10.0, 0.0, 0.0)),
+        ]
+    )
+    found = read_mission(tmp_path, flew, Pose.identity(), has_own_height=True)
+    assert found is not None
+    assert found.max_deviation_m == pytest.approx(0.2)
+    elsewhere = read_mission(tmp_path, flew, Pose.identity())
+    assert elsewhere is not None
+    assert elsewhere.max_deviation_m > 7.0

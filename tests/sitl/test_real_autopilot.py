@@ -18,6 +18,8 @@ import pytest
 from sitl.autopilots import px4
 from sitl.autopilots.firmware_options import FirmwareOptions
 from sitl.autopilots.flown import Firmware
+from sitl.autopilots.motion import RecordedMotion
+from sitl.autopilots.px4_parameters import RECORDED
 from sitl.autopilots.wire import Wire
 from tests.sitl.real_firmware import (
     ARDUPILOT,
@@ -33,14 +35,6 @@ from vcl_companion.daemon.parameter_rules import findings, names_of, rules_for
 from vcl_companion.daemon.resets import Resets
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.links.fusion import FusionState
-
-
-@pytest.fixture(params=[ARDUPILOT, PX4], ids=lambda real: real.kind)
-def real(request: pytest.FixtureRequest) -> Real:
-    wanted: Real = request.param
-    if not os.environ.get(wanted.variable):
-        pytest.skip(f"{wanted.variable} names no firmware")
-    return wanted
 
 
 def test_poses_are_fused_within_two_seconds_wherever_they_begin(real: Real, tmp_path: Path) -> None:
@@ -143,14 +137,15 @@ def test_px4_takes_a_velocity_with_our_poses(tmp_path: Path) -> None:
         assert flight.apart_m(fused).max() < 0.05
 
     # Velocity as well as position, height and heading.
-    parameters = {**px4.PARAMETERS, "EKF2_EV_CTRL": 15.0}
+    parameters = {**RECORDED, "EKF2_EV_CTRL": 15.0}
     flown(replace(PX4, parameters=parameters, message="odometry"), tmp_path, scenario)
 
 
 @pytest.mark.skipif(not os.environ.get("VCL_PX4"), reason="VCL_PX4 names no firmware")
 def test_px4_takes_our_instants_once_we_have_told_it_the_time(tmp_path: Path) -> None:
     def start(options: FirmwareOptions, wire: Wire, stack: ExitStack) -> Firmware:
-        return px4.Px4(options, wire, stack, tells_time=False)
+        assert isinstance(options.flies, RecordedMotion)
+        return px4.Px4(options, options.flies, wire, stack, tells_time=False)
 
     async def scenario(flight: Flight, fused: Path) -> None:
         # It takes no answer that is later than 10 ms.

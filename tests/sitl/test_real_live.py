@@ -1,6 +1,7 @@
-"""A real ArduCopter flies a mission by its own physics, and has no position but ours.
+"""A real firmware flies a mission, and has no position but ours.
 
-Runs when ``VCL_ARDUPILOT`` names a binary built for simulation.
+Runs with ArduCopter when ``VCL_ARDUPILOT`` names a binary built for simulation, with PX4 when
+``VCL_PX4`` names the folder of such a build.
 """
 
 from __future__ import annotations
@@ -13,11 +14,12 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-import pytest
 
+from sitl.firmware import parse_firmware
 from sitl.mission import COMMANDED_FILE, Mission
 from sitl.processes import end_children, start_child
 from sitl.stand_in_process import StandIn
+from tests.sitl.real_firmware import Real
 from vcl_companion.clock import ManualClock
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import matrix_from_euler
@@ -25,12 +27,8 @@ from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.vision_pose import PoseEstimate
 
-_BINARY = os.environ.get("VCL_ARDUPILOT", "")
-pytestmark = pytest.mark.skipif(not _BINARY, reason="VCL_ARDUPILOT names no arducopter")
-
 SYSTEM = 3
 START_NS = 1_000_000_000_000
-BOOTED_BEFORE_NS = 40_000_000_000
 STEP_NS, PERIOD_NS = 20_000_000, 100_000_000
 MISSION = Mission(
     (7.0, -3.0, 30.0),
@@ -39,21 +37,25 @@ MISSION = Mission(
 )
 
 
-# Its local frame begins where it stands, and its north is some way from the true one.
-LOCAL_FROM_NED = Pose(matrix_from_euler(0.0, 0.0, -0.6), np.zeros(3)) @ Pose(
-    np.eye(3), -MISSION.ned_from_body.translation
-)
+# The local frame begins where it stands. An ArduCopter's north may be some way from the true one; a
+# PX4 has found that by its compass before.
+NORTH_RAD = {"ardupilot": -0.6, "px4": 0.0}
+# When each is on its way; what it flies in then.
+UNDER_WAY_S = {"ardupilot": 9.0, "px4": 18.0}
+STEERED_IN = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}
 
 
 class Companion:
     """Our link to the firmware, which is told where it truly is."""
 
-    def __init__(self, autopilot: StandIn) -> None:
+    def __init__(self, real: Real, autopilot: StandIn) -> None:
         self.clock = ManualClock(START_NS)
         options = AutopilotOptions(link=f"udp:127.0.0.1:{autopilot.port}")
         self.link = AutopilotLink(options, SYSTEM, self.clock)
         self.autopilot = autopilot
         self.true: list[Pose] = []
+        north = Pose(matrix_from_euler(0.0, 0.0, NORTH_RAD[real.kind]), np.zeros(3))
+        self._local_from_ned = north @ Pose(np.eye(3), -MISSION.ned_from_body.translation)
 
     async def fly(self, seconds: float, silent_after_s: float = np.inf) -> None:
         until_ns = START_NS + round(seconds * 1e9)
@@ -69,17 +71,19 @@ class Companion:
             await asyncio.sleep(0.001)
 
     def _tell(self, at_ns: int) -> None:
-        told = LOCAL_FROM_NED @ self.true[-1]
+        told = self._local_from_ned @ self.true[-1]
         covariance = np.diag([0.02**2] * 3 + [1e-4] * 3)
         estimate = PoseEstimate(told, covariance, np.zeros(3), 0.01 * np.eye(3), at_ns, 0)
         assert self.link.poses.send(estimate) is None
 
 
-async def flown(tmp_path: Path, seconds: float, silent_after_s: float = np.inf) -> Companion:
+async def flown(
+    real: Real, tmp_path: Path, seconds: float, silent_after_s: float = np.inf
+) -> Companion:
     config = {
-        "binary": _BINARY,
+        "binary": str(parse_firmware(f"{real.kind}={os.environ[real.variable]}").path),
         "system_id": SYSTEM,
-        "boot_offset_ns": START_NS - BOOTED_BEFORE_NS,
+        "boot_offset_ns": START_NS - real.booted_before_ns,
         "mission": msgspec.to_builtins(MISSION),
         "begins_ns": START_NS + round(MISSION.begins_s * 1e9),
         "out": str(tmp_path / "out"),
@@ -89,13 +93,13 @@ async def flown(tmp_path: Path, seconds: float, silent_after_s: float = np.inf) 
     path.write_text(json.dumps(config))
     child = await start_child(
         "autopilot",
-        (sys.executable, "-m", "sitl.autopilots.ardupilot", str(path)),
+        (sys.executable, "-m", f"sitl.autopilots.{real.kind}", str(path)),
         log_prefix=tmp_path / "autopilot",
         environment={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
         piped=True,
     )
     try:
-        companion = Companion(await StandIn.of(child))
+        companion = Companion(real, await StandIn.of(child))
         await companion.autopilot.advance_to(START_NS)
         async with asyncio.timeout(300.0):
             link = asyncio.ensure_future(companion.link.run())
@@ -109,8 +113,10 @@ async def flown(tmp_path: Path, seconds: float, silent_after_s: float = np.inf) 
     return companion
 
 
-def test_it_arms_takes_off_goes_where_it_is_sent_and_lands_there(tmp_path: Path) -> None:
-    companion = asyncio.run(flown(tmp_path, 90.0))
+def test_it_arms_takes_off_goes_where_it_is_sent_and_lands_there(
+    real: Real, tmp_path: Path
+) -> None:
+    companion = asyncio.run(flown(real, tmp_path, 90.0))
     state = companion.autopilot.state
     said = (tmp_path / "out" / "said.csv").read_text()
     assert (state["is_over"], state["trouble"]) == (True, ""), said
@@ -130,10 +136,12 @@ def test_it_arms_takes_off_goes_where_it_is_sent_and_lands_there(tmp_path: Path)
     ]
 
 
-def test_where_we_fall_silent_it_gives_up_its_mission_and_lands_by_itself(tmp_path: Path) -> None:
-    companion = asyncio.run(flown(tmp_path, 90.0, silent_after_s=9.0))
+def test_where_we_fall_silent_it_gives_up_its_mission_and_lands_by_itself(
+    real: Real, tmp_path: Path
+) -> None:
+    companion = asyncio.run(flown(real, tmp_path, 90.0, UNDER_WAY_S[real.kind]))
     state = companion.autopilot.state
     said = (tmp_path / "out" / "said.csv").read_text()
     assert state["is_over"], said
-    assert "left GUIDED" in state["trouble"], said
+    assert f"left {STEERED_IN[real.kind]}" in state["trouble"], said
     assert abs(companion.true[-1].translation[2] + MISSION.gear_m) < 0.1

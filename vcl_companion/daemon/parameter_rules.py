@@ -164,7 +164,7 @@ def _px4(*, sends_velocity: bool) -> tuple[Rule, ...]:
     used = float(_EV_HPOS | _EV_VPOS | _EV_YAW)
     return (
         Rule(
-            ("EKF2_HGT_REF",), "dangerous", lambda value: round(value) != 3, 1.0,
+            ("EKF2_HGT_REF",), "dangerous", lambda value: round(value) != 3, 0.0,
             "with vision (3) a global origin throws its height by that origin's altitude at the "
             "next reset, and the drone climbs away",
         ),

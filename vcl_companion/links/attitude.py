@@ -5,7 +5,8 @@ turned into our time only when an attitude is asked for, by the best offset
 known then.
 
 An autopilot that begins to take its heading from our poses turns its north at once, by what it
-was wrong. Nobody turns so fast: its attitudes are told on as if it had not.
+was wrong. Nobody turns so fast: its attitudes are told on as if it had not. One that was told no
+pose yet has found its north by itself, as a PX4 does by its compass soon after its start.
 """
 
 from __future__ import annotations
@@ -114,6 +115,14 @@ class AttitudeHistory:
         self._samples.append(sample)
         self._arrivals.append(arrived_at_ns - self._measured_ns(sample))
         return taken
+
+    def take_its_north(self) -> None:
+        """Tell the newest sample, and those to come, in the north of now; forget the others."""
+        newest = self._samples[-1]
+        found = about_down(self._north_rad) @ newest.ned_from_body
+        self._samples.clear()
+        self._samples.append(replace(newest, ned_from_body=found))
+        self._north_rad = 0.0
 
     def clear(self) -> None:
         """Forget all samples."""

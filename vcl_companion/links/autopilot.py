@@ -75,12 +75,14 @@ class AutopilotLink:
         """Shown who asks for a parameter of ours, or sets one; only ground systems may set."""
         self._parameters = Parameters(self._read_parameter, self._write_parameter)
         self._fusion = FusionMonitor()
-        self.attitudes = TimedAttitude(options, clock, self._ask_for_time)
-        """What it says of how it is turned, by our clock."""
         self.poses = PoseSender(
             options, self._codec, self._transport.write, clock, self._tally, self._fusion
         )
         """Tells it where it is."""
+        self.attitudes = TimedAttitude(
+            options, clock, self._ask_for_time, lambda: self.poses.has_sent
+        )
+        """What it says of how it is turned, by our clock."""
         self._state = ServiceState.STARTING
         self.origin = OriginSetter(
             None if options.origin is None else GlobalPlace(*options.origin),

@@ -177,7 +177,7 @@ class OriginSetter:
             self._tell(Severity.WARNING, f"no origin is set: {HEIGHT_REFERENCE} is not said")
         elif round(reference) == HEIGHT_BY_VISION:
             self._is_settled = True
-            what = f"no origin is set: with {HEIGHT_REFERENCE} 3 it would climb away; set 1"
+            what = f"no origin is set: with {HEIGHT_REFERENCE} 3 it would climb away; set 0"
             self._tell(Severity.ERROR, what)
         else:
             return True

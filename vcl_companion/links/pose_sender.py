@@ -75,6 +75,11 @@ class PoseSender:
         return VISION_POSITION_ESTIMATE_ID if by_vision else ODOMETRY_ID
 
     @property
+    def has_sent(self) -> bool:
+        """Whether a pose has ever been sent."""
+        return self._first_reset is not None
+
+    @property
     def interval_s(self) -> float | None:
         """From one pose that was sent to the next, s; None when none goes out now."""
         now_s = asyncio.get_running_loop().time()

@@ -34,15 +34,24 @@ class TimedAttitude:
         options: how late and how old samples may be.
         clock: ours.
         ask: sends a TIMESYNC question, ns by our clock.
+        is_told: whether the autopilot has been told poses: what it turns its north by before is
+            its own.
     """
 
-    def __init__(self, options: AutopilotOptions, clock: Clock, ask: Callable[[int], None]) -> None:
+    def __init__(
+        self,
+        options: AutopilotOptions,
+        clock: Clock,
+        ask: Callable[[int], None],
+        is_told: Callable[[], bool],
+    ) -> None:
         latency_ns = round(options.attitude_latency_s * 1e9)
         max_age_ns = round(options.max_attitude_age_s * 1e9)
         self._by_quaternion = AttitudeHistory(latency_ns, max_age_ns)
         self._by_euler = AttitudeHistory(latency_ns, max_age_ns)
         self._clock = clock
         self._ask = ask
+        self._is_told = is_told
         self._sync = TimesyncEstimator()
         self._asked_at_s = -math.inf
         self._news = asyncio.Event()
@@ -134,7 +143,11 @@ class TimedAttitude:
         taken = history.add(sample, self._clock.now_ns())
         if taken == "turned":
             degrees = math.degrees(history.north_rad)
-            _log.info("the autopilot has turned its north, by %.1f degrees so far", degrees)
+            if self._is_told():
+                _log.info("the autopilot has turned its north, by %.1f degrees so far", degrees)
+            else:
+                history.take_its_north()
+                _log.info("the autopilot has found its north, by %.1f degrees", degrees)
         elif taken == "rebooted":
             self._sync.reset()
             (self._by_euler if quaternion else self._by_quaternion).clear()

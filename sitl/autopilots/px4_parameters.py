@@ -1,0 +1,33 @@
+"""The parameters of a PX4 that flies on our poses alone, in simulation, and why each is set."""
+
+from __future__ import annotations
+
+from sitl.mission import Mission
+
+RECORDED = {
+    # Position, height and heading by vision (its documentation, "Visual Inertial Odometry").
+    "EKF2_EV_CTRL": 11.0,
+    # No GPS, which is not missed before it arms either.
+    "EKF2_GPS_CTRL": 0.0,
+    "SYS_HAS_GPS": 0.0,
+    # Height is the barometer's, as with its default, GPS, where there is none.
+    "EKF2_HGT_REF": 0.0,
+    # What our poses say of their error is what it is.
+    "EKF2_EVP_NOISE": 0.01,
+    # What it hears is as late as we are quick: nothing on the way is to be made up for.
+    "EKF2_EV_DELAY": 0.0,
+    # Nobody reads its log.
+    "SDLOG_MODE": -1.0,
+}
+
+
+def of_a_mission(mission: Mission) -> dict[str, float]:
+    """Return those of one that flies by itself, with all of its checks before it arms."""
+    return {
+        **RECORDED,
+        # No remote control, nor a joystick; so who may not fly to setpoints any more lands.
+        "COM_RC_IN_MODE": 4.0,
+        "COM_OBL_RC_ACT": 4.0,
+        # How far it climbs when it takes off.
+        "MIS_TAKEOFF_ALT": -float(mission.places()[0, 2]) if mission.legs else 0.0,
+    }
