@@ -114,7 +114,7 @@ async def _flown(shop: Workshop, made: LandmarkMap, n_revisions: int) -> _Taken:
         give_back_freed()
         after.append(watch.now_mb())
     watching.cancel()
-    most = watch.most_mb()
+    most = max(watch.most_mb(), *after)  # it looks five times a second only
     work.end()
     assert maps.current is not None
     assert maps.current.templates is not None

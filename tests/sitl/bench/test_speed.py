@@ -62,7 +62,7 @@ def test_a_quick_run_measures_everything_and_finds_right_poses(tmp_path: Path) -
     assert all(figure.value > 0.0 for figure in result.figures)
     taken = {name: figures[f"memory, 1000 landmarks, {name}"] for name in (
         "tables", "3 revisions", "at most", "before the first map")}  # fmt: skip
-    assert taken["tables"].value < taken["3 revisions"].value < taken["at most"].value < 300.0
+    assert taken["tables"].value < taken["3 revisions"].value <= taken["at most"].value < 300.0
     # Of processes begun for that, not of this one.
     assert 80.0 < taken["before the first map"].value < 250.0
     landmarks, images = result.tables
