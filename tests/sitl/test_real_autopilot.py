@@ -187,7 +187,7 @@ def test_told_its_origin_before_poses_it_knows_its_global_position_by_them(tmp_p
         places, heard = (fused.with_name(name) for name in ("global.csv", "received.jsonl"))
         # Another drone's local frame: 30 m north, 20 m west and 2 m above of the leader's.
         flight.origin_world = np.array([30.0, -20.0, -2.0])
-        assert places.read_text() == ""
+        assert len(places.read_text().splitlines()) <= 1  # its first line at most
         while "VCL origin set" not in heard.read_text():
             assert flight.clock.now_ns() < START_NS + 20_000_000_000
             await flight.fly(1.0, sends=False)

@@ -130,8 +130,8 @@ class MapHanding:
         for peer in self._lacking(stored.revision):
             if self._group.is_coordinator and self._branches.is_awaited(peer, now_s):
                 continue
-            if self._group.state_of(peer) is None and self._parts.is_long(stored):
-                continue  # it is about to say what it has
+            if self._group.state_of(peer) is None:
+                continue  # it is about to say what it has, perhaps a map of a world of its own
             if not self._group.has_map(peer) and self._parts.comes_first(peer, stored):
                 continue
             self._hand(peer, stored, now_s, self._form_for)

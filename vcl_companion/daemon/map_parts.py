@@ -64,7 +64,7 @@ class MapParts:
         self._rests: dict[tuple[bytes, bytes], bytes] = {}  # by revision and part
         self._wanted: asyncio.Queue[bytes] = asyncio.Queue(1)  # the part of a rest; empty: a part
 
-    def is_long(self, stored: HandOut) -> bool:
+    def _is_long(self, stored: HandOut) -> bool:
         """Whether a map has parts; a first one is a frame of each drone: less of it is none."""
         return bool(stored.parent) and len(stored.data) > self._quick_bytes
 
@@ -76,7 +76,7 @@ class MapParts:
                 # Goes on, or begins again when it was given up.
                 self._sent[peer] = replace(sent, transfer_id=self._submit(peer, sent.blob))
             return not sent.has_arrived
-        if not self.is_long(stored):
+        if not self._is_long(stored):
             return False
         current = self._maps.current
         if current is None or current.revision != stored.revision:
