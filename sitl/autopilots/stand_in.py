@@ -136,14 +136,14 @@ class StandIn:
         self._now_ns: int | None = None
         self._companion: tuple[str, int] | None = None
         self._fusing = Fusing()
-        self._north = VisionNorth()
         self._interval_ns: dict[int, int] = {}
         self._backlog = Backlog()
         self._next_heartbeat_s = 0.0
         self._parameters = {**PARAMETERS, **options.parameters}
         # What an earlier flight's autopilot said had its north already.
         is_measured = isinstance(options.source, TruthAttitude)
-        self._has_no_north = is_measured and self._parameters[_YAW_SOURCE] == _BY_VISION
+        by_vision = self._parameters[_YAW_SOURCE] == _BY_VISION
+        self._north = VisionNorth() if is_measured and by_vision else None
         # latitude and longitude, 1e-7 degrees, altitude, mm: as ArduPilot it keeps its first
         self._origin: tuple[int, int, int] | None = None
         self._streams = {
@@ -250,7 +250,7 @@ class StandIn:
         at_ns = 1000 * message.usec
         position = np.array([message.x, message.y, message.z])
         pose = VisionPose(at_ns, position, message.covariance, message.reset_counter)
-        if self._fusing.take(pose):
+        if self._fusing.take(pose) and self._north is not None:
             self._north.reset(at_ns, message.yaw)
 
     def _obey(self, message: Any) -> int:
@@ -316,7 +316,7 @@ class StandIn:
         boot_ms = (at_ns - self._options.boot_offset_ns) // 1_000_000
         if not 0 <= boot_ms < 2**32:
             raise ConfigError(f"boot_offset_ns: {at_ns} is {boot_ms} ms after the start")
-        if self._has_no_north:
+        if self._north is not None:
             quaternion = self._north.of(at_ns, quaternion)
         # The wire has float32: what is kept is what was sent.
         sent = [float(value) for value in quaternion.astype(np.float32)]

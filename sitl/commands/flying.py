@@ -13,6 +13,7 @@ from sitl.commands.options import (
     parameters_option,
     settings_option,
     speed_option,
+    start_timeout_option,
 )
 
 _DEMO = Path(__file__).parents[1] / "recordings" / "demo"
@@ -52,13 +53,7 @@ def _names(text: str) -> tuple[str, ...]:
     show_default=True,
     help="Of the noise of the attitude made from the truth, and of the network.",
 )
-@click.option(
-    "--start-timeout",
-    default=30.0,
-    show_default=True,
-    metavar="S",
-    help="How long the daemons have to come up, and again to make the first map.",
-)
+@start_timeout_option(30.0)
 @settings_option
 @click.option(
     "--pipeline",
@@ -210,13 +205,7 @@ def fly(
     type=FOLDER,
     help="Begin with the last map of an earlier flight: its --out. One drone alone needs one.",
 )
-@click.option(
-    "--start-timeout",
-    default=60.0,
-    show_default=True,
-    metavar="S",
-    help="How long the daemons have to come up, and again to make the first map.",
-)
+@start_timeout_option(60.0)
 @settings_option
 def live(
     scenario: str,

@@ -8,7 +8,7 @@ from typing import Literal
 
 import click
 
-from sitl.commands.options import FOLDER, PIPELINES, speed
+from sitl.commands.options import FOLDER, PIPELINES, speed, start_timeout_option
 
 
 @click.command()
@@ -40,13 +40,7 @@ from sitl.commands.options import FOLDER, PIPELINES, speed
     metavar="S",
     help="Render and fly only the first S seconds: to try it out; nothing is judged then.",
 )
-@click.option(
-    "--start-timeout",
-    default=60.0,
-    show_default=True,
-    metavar="S",
-    help="How long the daemons have to come up, and again to make the first map.",
-)
+@start_timeout_option(60.0)
 @click.option(
     "--set",
     "settings",

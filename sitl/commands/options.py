@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TypeVar
 
 import click
+
+_Command = TypeVar("_Command", bound=Callable[..., Any])
 
 FOLDER = click.Path(path_type=Path)
 PIPELINES = ("default", "paper")
@@ -49,3 +53,14 @@ settings_option = click.option(
     metavar="SECTION.KEY=VALUE",
     help="More of the daemons' configuration, the value in TOML's notation (repeatable).",
 )
+
+
+def start_timeout_option(default_s: float) -> Callable[[_Command], _Command]:
+    """Return --start-timeout with a default."""
+    return click.option(
+        "--start-timeout",
+        default=default_s,
+        show_default=True,
+        metavar="S",
+        help="How long the daemons have to come up, and again to make the first map.",
+    )

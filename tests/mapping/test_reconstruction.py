@@ -20,12 +20,13 @@ from tests.scenes import (
 )
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.relative_attitude import RelativeAttitude
 from vcl_companion.geometry.rotation import Array, about_down, exp_so3
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.reconstruction import MapOptions, NoMap, reconstruct
 from vcl_companion.mapping.uncertainty import SHARED_NOISE_PX, map_uncertainty
-from vcl_companion.mapping.visibility import RelativeAttitude, choose_hypothesis
+from vcl_companion.mapping.visibility import choose_hypothesis
 from vcl_companion.vision.essential import RelativePose
 from vcl_companion.vision.features import Features
 

@@ -245,9 +245,7 @@ class Companion:
         now_s = asyncio.get_running_loop().time()
         follows = stored.templates is not None
         may_doubt = now_s >= self._doubted_at_s + _DOUBT_EVERY_S
-        effort = Effort(
-            may_search=not follows, may_doubt=may_doubt, has_heading=self._estimator.has_heading
-        )
+        effort = Effort(may_search=not follows, may_doubt=may_doubt)
         fix = await self._looked_at(frame, stored, ned_from_body, effort)
         if isinstance(fix, Localized) and is_doubtful(fix):
             self._doubted_at_s = now_s
@@ -287,7 +285,7 @@ class Companion:
             predicted.prior() if predicted else None,
             ned_from_body,
             self._options,
-            effort,
+            replace(effort, has_heading=self._estimator.has_heading),
         )
 
     @property
@@ -344,8 +342,7 @@ class Companion:
         stored = self._maps.current
         if stored is not None and stored.templates is not None:
             ned_from_body = await self._attitude_of(frame)
-            effort = replace(_PATCHES_ALONE, has_heading=self._estimator.has_heading)
-            fix = await self._looked_at(frame, stored, ned_from_body, effort)
+            fix = await self._looked_at(frame, stored, ned_from_body, _PATCHES_ALONE)
             if self._take(frame, fix, ned_from_body) is None:
                 self._outcomes.close(frame)
                 return

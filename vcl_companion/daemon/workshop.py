@@ -147,8 +147,7 @@ class Workshop:
         self, revision: bytes, frames: list[FrameAnswer], at_once: bool
     ) -> LandmarkMap | NoMap:
         """Build the next revision of a map; see ``update_map``."""
-        stored = self._named(revision)
-        self.keep_only(revision)
+        stored = self._alone(revision)
         return update_map(stored, frames, self._options.map, self._memory, at_once=at_once)
 
     def merged(self, revision: bytes, data: bytes) -> LandmarkMap | NoMap:
@@ -157,8 +156,7 @@ class Workshop:
         Raises:
             WireError: the bytes are no map.
         """
-        stored = self._named(revision)
-        self.keep_only(revision)
+        stored = self._alone(revision)
         built = merge_maps(stored, data, self._options.map, self._memory)
         give_back_freed()
         return built
@@ -225,8 +223,7 @@ class Workshop:
 
     def more_indexed(self, revision: bytes) -> MapIndex:
         """Return a map's index with those by the other detectors to fall back on."""
-        stored = self._named(revision)
-        self.keep_only(revision)
+        stored = self._alone(revision)
         options = self._options
         index = with_fallbacks(
             stored.index, options.detectors[1:], options.pipeline.features, self._other_memory
@@ -266,6 +263,12 @@ class Workshop:
     ) -> Proposal | NoProposal:
         """Propose where the drone was that saw a frame; see ``PeerLook``."""
         return self._look.from_frame(frame, state, self._named(revision), seen)
+
+    def _alone(self, revision: bytes) -> StoredMap:
+        """Return a map, and let go of the others."""
+        stored = self._named(revision)
+        self.keep_only(revision)
+        return stored
 
     def _named(self, revision: bytes) -> StoredMap:
         try:

@@ -60,7 +60,6 @@ class AutopilotLink:
     """Our side of the link to one autopilot; everything happens in the event loop's thread."""
 
     def __init__(self, options: AutopilotOptions, system_id: int, clock: Clock) -> None:
-        self._options = options
         self._system_id = system_id
         self._clock = clock
         self._tally = LinkTally()
@@ -105,11 +104,11 @@ class AutopilotLink:
     @property
     def options(self) -> AutopilotOptions:
         """How the autopilot is told; ``max_pose_age_s`` and ``time_error_s`` may be changed."""
-        return self._options
+        return self.poses.options
 
     @options.setter
     def options(self, options: AutopilotOptions) -> None:
-        self._options = self.poses.options = options
+        self.poses.options = options
 
     @property
     def counters(self) -> LinkCounters:
@@ -238,7 +237,7 @@ class AutopilotLink:
             case Heartbeat():
                 self._mode = mode_of(message)
                 self.origin.is_armed = self._mode.is_armed
-                if self._options.profile == "auto":
+                if self.options.profile == "auto":
                     self._is_of(firmware_of(message.autopilot))
             case CommandAck(command=command, result=result, target_system=target):
                 for_us = target in (0, self._system_id)
@@ -252,14 +251,14 @@ class AutopilotLink:
         is_for_us = message.target_system == self._system_id
         if not is_for_us or message.target_component not in (0, COMPONENT_COMPANION):
             self._tally.refuse("a command for somebody else")
-        elif message.sender_system not in (*self._options.ground_systems, self._system_id):
+        elif message.sender_system not in (*self.options.ground_systems, self._system_id):
             self._tally.refuse("a command of a stranger")
         elif self.on_command is not None:
             self.on_command(message)
 
     def _take_parameter_order(self, message: ParameterOrder) -> None:
         """Hand on who asks for our parameters; anybody aboard may look, the ground may set."""
-        may = self._options.ground_systems
+        may = self.options.ground_systems
         if not isinstance(message, ParameterSet):
             may = (*may, self._system_id)
         for_us = message.target_system in (0, self._system_id)

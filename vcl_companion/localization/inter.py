@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.relative_attitude import relative_attitude
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pair_evidence import (
@@ -88,7 +89,8 @@ def localize_inter(
     ideal_host = host.camera.ideal_from_pixels(host.features.pixels[i])
     ideal_target = target.camera.ideal_from_pixels(target.features.pixels[k])
     focal_px = 0.5 * (host.camera.focal_px + target.camera.focal_px)
-    guess = _rotation_guess(host, target)
+    attitude = relative_attitude(host, target)
+    guess = None if attitude is None else attitude.b_from_a
     hypotheses = relative_poses(ideal_host, ideal_target, focal_px, guess, EssentialOptions(), seed)
     hypotheses = [h for h in hypotheses if h.inliers.sum() >= options.min_matches]
     if not hypotheses:
@@ -155,16 +157,6 @@ def _spread(best: _Placed, rivals: list[_Placed]) -> Array:
         spread += weight * np.outer(off, off)
         total += weight
     return spread / total
-
-
-def _rotation_guess(host: Observer, target: Observer) -> Array | None:
-    """Return camera target_from_host (3, 3) by the two autopilots."""
-    if host.ned_from_body is None or target.ned_from_body is None:
-        return None
-    if not (host.has_heading and target.has_heading):
-        return None
-    ned_from_target = target.ned_from_body @ target.body_from_cam.rotation
-    return np.asarray(ned_from_target.T @ host.ned_from_body @ host.body_from_cam.rotation)
 
 
 def _expected_rotation(host: Observer, host_pose: Pose, target: Observer) -> Array | None:

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, about_down, heading_of, log_so3
+from vcl_companion.geometry.relative_attitude import RelativeAttitude, relative_attitude
+from vcl_companion.geometry.rotation import Array, log_so3
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.tracks import PairMatches
@@ -48,44 +49,6 @@ def visibility_graph(
             for i, k in combinations(range(len(drones)), 2)
         }
     return {(i, k): _edge(drones[i], drones[k], m, options, seed) for (i, k), m in matched.items()}
-
-
-@dataclass(frozen=True, eq=False)
-class RelativeAttitude:
-    """How two cameras are turned to each other by their autopilots.
-
-    Attributes:
-        ned_from_a: (3, 3) of the one camera.
-        ned_from_b: (3, 3) of the other.
-        has_heading: whether both are by one north; else only by one vertical.
-    """
-
-    ned_from_a: Array
-    ned_from_b: Array
-    has_heading: bool = True
-
-    @property
-    def b_from_a(self) -> Array | None:
-        """(3, 3) the rotation; None without a heading."""
-        return self.ned_from_b.T @ self.ned_from_a if self.has_heading else None
-
-    def off_rad(self, b_from_a: Array) -> float:
-        """Return by how much a (3, 3) rotation contradicts them."""
-        off = self.ned_from_b @ b_from_a @ self.ned_from_a.T
-        if not self.has_heading:
-            off = about_down(-heading_of(off)) @ off
-        return float(np.linalg.norm(log_so3(off)))
-
-
-def relative_attitude(a: DroneView, b: DroneView) -> RelativeAttitude | None:
-    """Return how two views' cameras are turned to each other; None where one has no attitude."""
-    if a.ned_from_body is None or b.ned_from_body is None:
-        return None
-    return RelativeAttitude(
-        a.ned_from_body @ a.body_from_cam.rotation,
-        b.ned_from_body @ b.body_from_cam.rotation,
-        a.has_heading and b.has_heading,
-    )
 
 
 def choose_hypothesis(
