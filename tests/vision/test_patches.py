@@ -14,7 +14,8 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3
 from vcl_companion.vision.features import Image
-from vcl_companion.vision.patch_kernels import FLAT, FOUND, OUTSIDE, UNLIKE, bent, seen_from
+from vcl_companion.vision.patch_kernels import FLAT, FOUND, OUTSIDE, UNLIKE
+from vcl_companion.vision.patch_views import bent, seen_from
 from vcl_companion.vision.patches import (
     Alignment,
     AlignRules,

@@ -2,7 +2,8 @@
 
 An anchor is a landmark in one keyframe: the pixel it stands for there, how far
 away it is, and how its surface is inclined. Everything a frame needs of a map
-is laid out once as plain tables for the compiled loops (``patch_kernels``).
+is laid out once as plain tables for the compiled loops (``patch_views``,
+``patch_kernels``).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.vision import patch_kernels as kernels
+from vcl_companion.vision import patch_views
 from vcl_companion.vision.features import Image
 
 Ints = NDArray[np.int64]
@@ -67,7 +69,7 @@ class Lens:
     """A camera as the compiled loops read it.
 
     Attributes:
-        table: (10,) see ``patch_kernels``.
+        table: (10,) see ``patch_views``.
         reach: largest squared ideal radius in view; beyond, the distortion is no lens.
         size_px: width and height.
     """
@@ -80,7 +82,7 @@ class Lens:
 @lru_cache(maxsize=64)
 def lens_of(camera: Camera) -> Lens:
     """Lay out a camera's intrinsics."""
-    table = np.zeros(kernels.N_LENS)
+    table = np.zeros(patch_views.N_LENS)
     table[:5] = (
         _MODELS[camera.distortion_model],
         camera.fx_px,
@@ -228,7 +230,7 @@ def choose_anchors(
     """
     cam_from_world = (world_from_body @ body_from_cam).inverse()
     images = anchors.images
-    return kernels.choose(
+    return patch_views.choose(
         anchors.first,
         anchors.keyframe,
         anchors.planes,
@@ -350,16 +352,21 @@ def align_patches(
         rules: when an alignment is believed.
     """
     images = anchors.images
-    pixels, ideal, slopes, noise, misplaced, marks, status = kernels.align(
+    views, seen = patch_views.viewed(
         chosen,
         anchors.keyframe,
         anchors.planes,
-        anchors.pixels,
-        images.texels,
-        images.shelves,
         lens.table,
         lens.reach,
         images.transforms(cam_from_world),
+    )
+    pixels, noise, misplaced, scores, status = kernels.align(
+        views,
+        seen,
+        anchors.keyframe[chosen],
+        anchors.pixels[chosen],
+        images.texels,
+        images.shelves,
         frame.texels,
         frame.shelves,
         radii_px,
@@ -378,6 +385,6 @@ def align_patches(
         ),
         min(level, len(frame.shelves) - 1),
     )
-    return Alignment(
-        chosen, pixels[:, :2], pixels[:, 2:], ideal, slopes, noise, misplaced, marks[:, 0], status
-    )
+    ideal, slopes = patch_views.unbent(lens.table, pixels, views)
+    predicted = np.where(seen[:, None], views[:, 3:5], np.nan)
+    return Alignment(chosen, predicted, pixels, ideal, slopes, noise, misplaced, scores, status)
