@@ -32,9 +32,21 @@ def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
     Returns:
         The compiled function, called like the original.
     """
-    compiler = numba.njit(nogil=True, error_model="numpy")
+    return _compiled(function, False)
+
+
+def reordered(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Compile a kernel whose sums may be added up in any order, and so many numbers at once.
+
+    What is no number, or infinite, stays so; otherwise as ``compiled``.
+    """
+    return _compiled(function, {"reassoc", "contract", "nsz"})
+
+
+def _compiled(function: Callable[_P, _R], fastmath: bool | set[str]) -> Callable[_P, _R]:
+    compiler = numba.njit(nogil=True, error_model="numpy", fastmath=fastmath)
     try:
-        kept = numba.njit(nogil=True, error_model="numpy", cache=True)(function)
+        kept = numba.njit(nogil=True, error_model="numpy", fastmath=fastmath, cache=True)(function)
     except RuntimeError:  # "no locator available": there is no folder to keep it in
         kept = compiler(function)
     return cast("Callable[_P, _R]", kept)

@@ -2,6 +2,10 @@
 
 What they look like from the frame, and where they are expected, is in ``patch_views``.
 
+A patch lies row by row in ``_WIDE`` columns, its own and two more: of the margin, or of nothing.
+So does what is looked at of the frame; all loops run over whole rows of both, in single precision,
+and the compiler takes many texels at once.
+
 Layout of the tables:
   texels (uint8), shelves (V, L, 3) int64: start, height, width of each pyramid level
 """
@@ -14,40 +18,70 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision.compiled import compiled
+from vcl_companion.vision.compiled import compiled, reordered
 
 Ints = NDArray[np.int64]
 Texels = NDArray[np.uint8]
+Singles = NDArray[np.float32]
 
 HALF = 4
 SIDE = 2 * HALF + 1
+_WIDE = SIDE + 2
+# Loops are over so many, a multiple of what any machine takes at once: the rows, and zeros.
+_N_PATCH, _N_MARGINED = 112, 128
 # By how much bilinear interpolation reduces the variance of white noise, on average.
 _SMOOTHED = 4.0 / 9.0
 # Where a patch's far side is so many times farther than its middle, it is edge on.
 _LEAST_DIVISOR = 0.5
 _LEAST_SHARE = 0.125
+# Rounding in single precision stays within an image.
+_ROUNDING_PX = 1e-3
 # Why a patch was not found.
 FOUND, OUTSIDE, FLAT, UNLIKE, WANDERED, UNSETTLED = 0, 1, 2, 3, 4, 5
 
+# Where in the patch each number of a row-by-row table stands; 1 for those of the patch itself.
+_AT = np.arange(_N_MARGINED)
+_ACROSS = np.where(_AT < _WIDE**2, _AT % _WIDE - HALF - 1, 0).astype(np.float32)
+_DOWN = np.where(_AT < _WIDE**2, _AT // _WIDE - HALF - 1, 0).astype(np.float32)
+_OF_PATCH = ((_AT % _WIDE < SIDE) & (_AT < SIDE * _WIDE)).astype(np.float32)[:_N_PATCH]
 
-@compiled
-def sampled(texels: Texels, start: int, height: int, width: int, u: float, v: float) -> float:
-    """Return the grey level at a pixel of one pyramid level, bilinear; the caller keeps inside."""
-    column, row = int(u), int(v)
-    a, b = u - column, v - row
-    # Not signed: numba looks out for negative positions otherwise.
-    at, one = np.uint64(start + row * width + column), np.uint64(1)
-    below = at + np.uint64(width)
-    top = texels[at] * (1.0 - a) + texels[at + one] * a
-    bottom = texels[below] * (1.0 - a) + texels[below + one] * a
-    return float(top * (1.0 - b) + bottom * b)
+
+@reordered
+def _placed(
+    u: float,
+    v: float,
+    width: int,
+    back: Array,
+    places: NDArray[np.int32],
+    across: Singles,
+    down: Singles,
+) -> None:
+    """Fill where texels of a patch and its margin are: place in the image, shares to the next."""
+    u0, v0, wide = np.float32(u), np.float32(v), np.int32(width)
+    a, b, c, d = np.float32(back[0]), np.float32(back[1]), np.float32(back[2]), np.float32(back[3])
+    e, f, one = np.float32(back[4]), np.float32(back[5]), np.float32(1.0)
+    for k in range(_N_MARGINED):
+        i, j = _DOWN[k], _ACROSS[k]
+        scaled = one / (one + e * j + f * i)
+        x, y = u0 + (a * j + b * i) * scaled, v0 + (c * j + d * i) * scaled
+        column, row = np.int32(x), np.int32(y)
+        places[k] = row * wide + column
+        across[k], down[k] = x - np.float32(column), y - np.float32(row)
 
 
 @compiled
 def warped(
-    texels: Texels, shelves: Ints, key_u: float, key_v: float, back: Array, out: Array
+    texels: Texels,
+    shelves: Ints,
+    key_u: float,
+    key_v: float,
+    back: Array,
+    places: NDArray[np.int32],
+    across: Singles,
+    down: Singles,
+    out: Singles,
 ) -> bool:
-    """Fill (SIDE + 2, SIDE + 2) grey levels of a keyframe around a pixel, by a homography.
+    """Fill grey levels of a keyframe around a pixel, by a homography.
 
     Args:
         texels: of all keyframes.
@@ -56,7 +90,10 @@ def warped(
         key_v: its row.
         back: (6,) d(keyframe pixel) / d(patch pixel) at the centre, and the relative change
             per patch pixel of what divides it.
-        out: the patch with a margin of one.
+        places: (_N_MARGINED,) to work with, like the next two.
+        across: likewise.
+        down: likewise.
+        out: (_WIDE * _WIDE or more,) the patch with a margin of one.
 
     Returns:
         Whether all of it lies inside the keyframe.
@@ -72,31 +109,113 @@ def warped(
         level, share = level + 1, 0.0
     n_levels = 2 if share > 0.0 else 1
     reach = HALF + 1
-    e, f = back[4], back[5]
-    least = 1.0 - reach * (abs(e) + abs(f))
+    least = 1.0 - reach * (abs(back[4]) + abs(back[5]))
     if not least > _LEAST_DIVISOR:
         return False
+    shrunk = back.copy()
     for step in range(n_levels):
         start, height, width = shelves[level + step]
         shrink = 1.0 / (1 << (level + step))
-        weight = share if step == 1 else 1.0 - share
-        su, sv = key_u * shrink, key_v * shrink
-        a, b, c, d = back[0] * shrink, back[1] * shrink, back[2] * shrink, back[3] * shrink
-        far_u, far_v = reach * (abs(a) + abs(b)) / least, reach * (abs(c) + abs(d)) / least
-        if not (su - far_u >= 0.0 and sv - far_v >= 0.0):
+        weight = np.float32(share if step == 1 else 1.0 - share)
+        u, v = key_u * shrink, key_v * shrink
+        for k in range(4):
+            shrunk[k] = back[k] * shrink
+        far_u = reach * (abs(shrunk[0]) + abs(shrunk[1])) / least + _ROUNDING_PX
+        far_v = reach * (abs(shrunk[2]) + abs(shrunk[3])) / least + _ROUNDING_PX
+        if not (u - far_u >= 0.0 and v - far_v >= 0.0):
             return False
-        if not (su + far_u < width - 1.0 and sv + far_v < height - 1.0):
+        if not (u + far_u < width - 1.0 and v + far_v < height - 1.0):
             return False
-        for i in range(-reach, reach + 1):
-            for j in range(-reach, reach + 1):
-                scaled = 1.0 / (1.0 + e * j + f * i)
-                u, v = su + (a * j + b * i) * scaled, sv + (c * j + d * i) * scaled
-                grey = sampled(texels, start, height, width, u, v)
-                if step == 0:
-                    out[i + reach, j + reach] = weight * grey
-                else:
-                    out[i + reach, j + reach] += weight * grey
+        left, top = int(u - far_u), int(v - far_v)
+        _placed(u - left, v - top, width, shrunk, places, across, down)
+        # Not signed: numba looks out for negative positions otherwise.
+        corner, one = np.uint64(start + top * width + left), np.uint64(1)
+        below = corner + np.uint64(width)
+        for k in range(_WIDE * _WIDE):
+            at, under = corner + np.uint64(places[k]), below + np.uint64(places[k])
+            near, next_ = np.float32(texels[at]), np.float32(texels[at + one])
+            upper = near + across[k] * (next_ - near)
+            near, next_ = np.float32(texels[under]), np.float32(texels[under + one])
+            lower = near + across[k] * (next_ - near)
+            grey = weight * (upper + down[k] * (lower - upper))
+            out[k] = grey if step == 0 else out[k] + grey
     return True
+
+
+@reordered
+def _based(patch: Singles, basis: Singles, normal: Array) -> None:
+    """Fill a patch and its gradients, each of zero mean, and the upper half of their products.
+
+    Of zero mean, so that the bias drops out; zero beside the patch.
+    """
+    n, half = np.float32(SIDE * SIDE), np.float32(0.5)
+    zero = np.float32(0.0)
+    here, right, left = patch[_WIDE + 1 :], patch[_WIDE + 2 :], patch[_WIDE:]
+    above, under = patch[1:], patch[2 * _WIDE + 1 :]
+    t_sum, x_sum, y_sum = zero, zero, zero
+    for k in range(_N_PATCH):
+        t_sum += _OF_PATCH[k] * here[k]
+        x_sum += _OF_PATCH[k] * (right[k] - left[k])
+        y_sum += _OF_PATCH[k] * (under[k] - above[k])
+    t_mean, x_mean, y_mean = t_sum / n, half * x_sum / n, half * y_sum / n
+    tt, tx, ty, xx, xy, yy = zero, zero, zero, zero, zero, zero
+    for k in range(_N_PATCH):
+        t = _OF_PATCH[k] * (here[k] - t_mean)
+        x = _OF_PATCH[k] * (half * (right[k] - left[k]) - x_mean)
+        y = _OF_PATCH[k] * (half * (under[k] - above[k]) - y_mean)
+        basis[0, k], basis[1, k], basis[2, k] = t, x, y
+        tt += t * t
+        tx += t * x
+        ty += t * y
+        xx += x * x
+        xy += x * y
+        yy += y * y
+    normal[0, 0], normal[0, 1], normal[0, 2] = tt, tx, ty
+    normal[1, 1], normal[1, 2], normal[2, 2] = xx, xy, yy
+
+
+@compiled
+def _cut(image: Texels, corner: int, width: int, out: Singles) -> None:
+    """Fill the texels that a patch lies on, and one more to the right and below.
+
+    Less the grey of the middle: of small numbers single precision loses little.
+    """
+    pivot = np.float32(image[corner + HALF * width + HALF])
+    for r in range(SIDE + 1):
+        at = corner + r * width
+        # From zero on: numba looks out for negative positions otherwise.
+        line, row = image[at : at + SIDE + 1], out[r * _WIDE : r * _WIDE + SIDE + 1]
+        for c in range(SIDE + 1):
+            row[c] = np.float32(line[c]) - pivot
+
+
+@reordered
+def _compared(
+    texels: Singles, a: float, b: float, basis: Singles
+) -> tuple[float, float, float, float, float]:
+    """Return sums over a patch of the frame: grey, its square, its products with the basis.
+
+    Args:
+        texels: as ``_cut`` fills them.
+        a: of a texel, how far to the right of the first the patch begins.
+        b: how far below.
+        basis: (3, _N_PATCH) zero beside the patch.
+    """
+    w00, w01 = np.float32((1.0 - a) * (1.0 - b)), np.float32(a * (1.0 - b))
+    w10, w11 = np.float32((1.0 - a) * b), np.float32(a * b)
+    zero = np.float32(0.0)
+    s, s2, st, sx, sy = zero, zero, zero, zero, zero
+    right, under, beyond = texels[1:], texels[_WIDE:], texels[_WIDE + 1 :]
+    template, by_x, by_y = basis[0], basis[1], basis[2]
+    for k in range(_N_PATCH):
+        grey = w00 * texels[k] + w01 * right[k] + w10 * under[k] + w11 * beyond[k]
+        own = _OF_PATCH[k] * grey
+        s += own
+        s2 += own * grey
+        st += grey * template[k]
+        sx += grey * by_x[k]
+        sy += grey * by_y[k]
+    return float(s), float(s2), float(st), float(sx), float(sy)
 
 
 @compiled
@@ -105,7 +224,7 @@ def align(
     seen: NDArray[np.bool_],
     keyframe: Ints,
     key_pixels: Array,
-    texels: Texels,
+    key_texels: Texels,
     shelves: Ints,
     image: Texels,
     levels: Ints,
@@ -124,7 +243,7 @@ def align(
         seen: (M,) whether they do (``patch_views.viewed``).
         keyframe: (M,) where each patch is cut from, and
         key_pixels: (M, 2) at which pixel there.
-        texels: of all keyframes.
+        key_texels: of all keyframes.
         shelves: (V, L, 3) of all keyframes.
         image: texels of the frame's pyramid.
         levels: (L, 3) shelves of the frame's pyramid.
@@ -145,8 +264,11 @@ def align(
     pixels = np.full((m, 2), np.nan)
     noises, misplaced = np.zeros((m, 3)), np.zeros((m, 3))
     scores, status = np.zeros(m), np.full(m, OUTSIDE)
-    patch = np.empty((SIDE + 2, SIDE + 2))
-    basis = np.empty((3, SIDE, SIDE))
+    patch = np.zeros(_N_PATCH + 2 * _WIDE + 1, np.float32)
+    basis = np.empty((3, _N_PATCH), np.float32)
+    texels = np.zeros(_N_PATCH + _WIDE + 1, np.float32)
+    places = np.empty(_N_MARGINED, np.int32)
+    across, down = np.empty(_N_MARGINED, np.float32), np.empty(_N_MARGINED, np.float32)
     back = np.empty(6)
     normal, inverse = np.empty((3, 3)), np.empty((3, 3))
     for i in range(m):
@@ -163,39 +285,13 @@ def align(
         back[2], back[3] = -size * view[11] / det, size * view[9] / det
         back[4], back[5] = size * view[13], size * view[14]
         if not warped(
-            texels, shelves[keyframe[i]], key_pixels[i, 0], key_pixels[i, 1], back, patch
-        ):
+            key_texels, shelves[keyframe[i]], key_pixels[i, 0], key_pixels[i, 1], back,
+            places, across, down, patch,
+        ):  # fmt: skip
             continue
         start, height, width = levels[level]
         u0, v0 = view[3] / size, view[4] / size
-        mean = 0.0
-        for r in range(SIDE):
-            for c in range(SIDE):
-                mean += patch[r + 1, c + 1]
-        mean /= SIDE * SIDE
-        gx_mean, gy_mean = 0.0, 0.0
-        for r in range(SIDE):
-            for c in range(SIDE):
-                basis[0, r, c] = patch[r + 1, c + 1] - mean
-                basis[1, r, c] = 0.5 * (patch[r + 1, c + 2] - patch[r + 1, c])
-                basis[2, r, c] = 0.5 * (patch[r + 2, c + 1] - patch[r, c + 1])
-                gx_mean += basis[1, r, c]
-                gy_mean += basis[2, r, c]
-        gx_mean /= SIDE * SIDE
-        gy_mean /= SIDE * SIDE
-        # With all three of zero mean the bias drops out.
-        normal[:] = 0.0
-        for r in range(SIDE):
-            for c in range(SIDE):
-                basis[1, r, c] -= gx_mean
-                basis[2, r, c] -= gy_mean
-                t, gx, gy = basis[0, r, c], basis[1, r, c], basis[2, r, c]
-                normal[0, 0] += t * t
-                normal[0, 1] += t * gx
-                normal[0, 2] += t * gy
-                normal[1, 1] += gx * gx
-                normal[1, 2] += gx * gy
-                normal[2, 2] += gy * gy
+        _based(patch, basis, normal)
         energy = normal[0, 0]
         if not _inverted(normal, inverse):
             status[i] = FLAT
@@ -210,28 +306,22 @@ def align(
                 status[i] = UNLIKE
                 continue
         begin_u, begin_v = u, v
+        cut = -1
         status[i] = UNSETTLED
         score, residual, smoothed = 0.0, 0.0, 1.0
         for iteration in range(int(rules[0]) + 1):
             if not (HALF <= u < width - HALF - 1 and HALF <= v < height - HALF - 1):
                 status[i] = OUTSIDE
                 break
-            s, s2, st, sx, sy = 0.0, 0.0, 0.0, 0.0, 0.0
             column, row = int(u), int(v)
+            corner = start + (row - HALF) * width + column - HALF
+            if corner != cut:
+                cut = corner
+                _cut(image, corner, width, texels)
             a, b = u - column, v - row
             w00, w01, w10, w11 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
             smoothed = w00 * w00 + w01 * w01 + w10 * w10 + w11 * w11
-            for r in range(SIDE):
-                at = start + (row + r - HALF) * width + column - HALF
-                # From zero on: numba looks out for negative positions otherwise.
-                top, bottom = image[at : at + SIDE + 1], image[at + width : at + width + SIDE + 1]
-                for c in range(SIDE):
-                    grey = w00 * top[c] + w01 * top[c + 1] + w10 * bottom[c] + w11 * bottom[c + 1]
-                    s += grey
-                    s2 += grey * grey
-                    st += grey * basis[0, r, c]
-                    sx += grey * basis[1, r, c]
-                    sy += grey * basis[2, r, c]
+            s, s2, st, sx, sy = _compared(texels, a, b, basis)
             spread = s2 - s * s / (SIDE * SIDE)
             gain = inverse[0, 0] * st + inverse[0, 1] * sx + inverse[0, 2] * sy
             ex = inverse[1, 0] * st + inverse[1, 1] * sx + inverse[1, 2] * sy
@@ -277,7 +367,7 @@ def align(
     return pixels, noises, misplaced, scores, status
 
 
-@compiled
+@reordered
 def _searched(
     image: Texels,
     start: int,
@@ -286,37 +376,51 @@ def _searched(
     u0: float,
     v0: float,
     radius: int,
-    patch: Array,
+    template: Singles,
     energy: float,
 ) -> tuple[float, float, float]:
     """Return the pixel near (u0, v0) that correlates best with a zero-mean patch, and its score.
 
-    Whole steps around the prediction, so that a right one is not moved.
+    Whole steps around the prediction, so that a right one is not moved. Every step through the
+    window is a number of the same line: those at the ends of its rows, where a patch would go on
+    in the next one, are counted and not looked at.
     """
-    best, best_u, best_v = -2.0, u0, v0
     column, row = math.floor(u0 + 0.5), math.floor(v0 + 0.5)
-    for dv in range(-radius, radius + 1):
-        centre_v = row + dv
-        if centre_v < HALF or centre_v >= height - HALF:
-            continue
-        for du in range(-radius, radius + 1):
-            centre_u = column + du
-            if centre_u < HALF or centre_u >= width - HALF:
-                continue
-            s, s2 = 0, 0
-            st = 0.0
-            for r in range(SIDE):
-                at = start + (centre_v + r - HALF) * width + centre_u - HALF
-                line = image[at : at + SIDE]
-                for c in range(SIDE):
-                    grey = int(line[c])
-                    s += grey
-                    s2 += grey * grey
-                    st += grey * patch[r, c]
-            spread = s2 - s * s / (SIDE * SIDE)
-            score = st / math.sqrt(max(spread * energy, 1e-9))
+    left, right = max(column - radius, HALF), min(column + radius, width - HALF - 1)
+    top, bottom = max(row - radius, HALF), min(row + radius, height - HALF - 1)
+    if left > right or top > bottom:
+        return u0, v0, -2.0
+    wide, high = right - left + SIDE, bottom - top + SIDE
+    n = (bottom - top + 1) * wide
+    window = np.zeros(high * wide + SIDE, np.float32)
+    # Less some grey of it, so that all sums of whole numbers are exact.
+    pivot = np.float32(image[start + (top + bottom) // 2 * width + (left + right) // 2])
+    for r in range(high):
+        at = start + (top - HALF + r) * width + left - HALF
+        line, row_out = image[at : at + wide], window[r * wide : (r + 1) * wide]
+        for c in range(wide):
+            row_out[c] = np.float32(line[c]) - pivot
+    sums, squares = np.zeros(n, np.float32), np.zeros(n, np.float32)
+    products = np.zeros(n, np.float32)
+    for r in range(SIDE):
+        greys, weights = window[r * wide :], template[r * _WIDE :]
+        for k in range(n):
+            s, s2, st = sums[k], squares[k], products[k]
+            for c in range(SIDE):
+                grey = greys[k + c]
+                s += grey
+                s2 += grey * grey
+                st += grey * weights[c]
+            sums[k], squares[k], products[k] = s, s2, st
+    best, best_u, best_v = -2.0, u0, v0
+    for i in range(bottom - top + 1):
+        for j in range(right - left + 1):
+            k = i * wide + j
+            total = float(sums[k])
+            spread = float(squares[k]) - total * total / (SIDE * SIDE)
+            score = float(products[k]) / math.sqrt(max(spread * energy, 1e-9))
             if score > best:
-                best, best_u, best_v = score, float(centre_u), float(centre_v)
+                best, best_u, best_v = score, float(left + j), float(top + i)
     return best_u, best_v, best
 
 
