@@ -11,7 +11,8 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.vision.bundle import linearized
-from vcl_companion.vision.pose_kernels import CONVERGED, SINGULAR, converged, gained, supported
+from vcl_companion.vision.pose_errors import gained
+from vcl_companion.vision.pose_kernels import CONVERGED, SINGULAR, converged, supported
 from vcl_companion.vision.resection import Resection, ResectionOptions, Sightings, refine
 
 _SCALES = np.array([8.0, 3.0, 1.0, 1.0])
@@ -73,14 +74,16 @@ def test_the_same_pose_and_covariance_as_the_refinement_in_arrays(camera: Camera
     found = Pose(matrix[:, :3], matrix[:, 3])
     assert_pose_close(found, in_arrays(start, sightings), within_m=1e-5, within_rad=1e-6)
     assert_pose_close(found, expected.world_from_body, within_m=1e-7, within_rad=1e-8)
-    agrees, normal, j_pose, j_point, information = supported(matrix, *system, 18.42)
-    assert np.array_equal(agrees.astype(bool), expected.inliers)
+    agrees, normal, j_poses, j_points, roots, weights, squared_px = supported(
+        matrix, *system, 18.42
+    )
+    assert np.array_equal(agrees, expected.inliers)
     n = len(agrees)
-    assert np.isclose(np.sqrt(information[-1, 0] / agrees.sum()), expected.rms_px)
+    assert np.isclose(np.sqrt(squared_px / agrees.sum()), expected.rms_px)
     levers = rng.standard_normal((n, 3, 12)).astype(np.float32)
     own = rng.standard_normal((n, 3))
     leverage, parts, lever = gained(
-        agrees, np.linalg.inv(normal), j_pose, j_point, information,
+        np.linalg.inv(normal), j_poses, j_points, roots, weights,
         np.tile([0.16, 0.0, 0.16], (n, 1)), np.tile([0.09, 0.0, 0.09], (n, 1)),
         own, np.arange(n, dtype=np.int64), levers,
     )  # fmt: skip

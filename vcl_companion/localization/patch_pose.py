@@ -21,6 +21,7 @@ _AGREED = 0.7
 _N_STRIPS = 3
 
 System = tuple[Array, Array, Array, Array, Array, Array, Array]
+Support = tuple[NDArray[np.bool_], Array, Array, Array, Array, Array, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,14 +83,12 @@ class PatchPoses:
         """Return how many patches agree with a pose."""
         return int(self._agreeing(found, pose).sum())
 
-    def support(
-        self, found: Alignment, pose: Pose
-    ) -> tuple[NDArray[np.int64], Array, Array, Array, Array]:
+    def support(self, found: Alignment, pose: Pose) -> Support:
         """Return who agrees with a pose, and how they fix it (``pose_kernels.supported``)."""
         return supported(*self._system(pose, found), 2.0 * _CHI2_2_99)
 
     def _agreeing(self, found: Alignment, pose: Pose) -> NDArray[np.bool_]:
-        return np.asarray(self.support(found, pose)[0] > 0)
+        return self.support(found, pose)[0]
 
     def _without_a_third(self, pixels: Array) -> Iterator[NDArray[np.bool_]]:
         for axis in (0, 1):

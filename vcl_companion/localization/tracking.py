@@ -33,7 +33,7 @@ from vcl_companion.vision.patches import (
     lens_of,
     pyramid_of,
 )
-from vcl_companion.vision.pose_kernels import gained
+from vcl_companion.vision.pose_errors import gained
 
 _MAX_LEVERAGE = 0.4
 _ROBUST_LOSS = 1.1136
@@ -259,7 +259,8 @@ class _Tracker:
             if isinstance(refined, NotLocalized):
                 return refined
             pose = refined
-            agrees, normal, j_pose, j_point, information = self._poses.support(found, pose)
+            support = self._poses.support(found, pose)
+            agrees, normal, j_poses, j_points, roots, weights, squared_px = support
             n = int(agrees.sum())
             if n < self._belief.min_inliers:
                 least = self._belief.min_inliers
@@ -268,7 +269,7 @@ class _Tracker:
             if inverse is None:
                 return NotLocalized("the patches found do not fix a pose", n_tried, n)
             leverage, covariances, lever = gained(
-                agrees, inverse, j_pose, j_point, information, found.noise, found.misplaced,
+                inverse, j_poses, j_points, roots, weights, found.noise, found.misplaced,
                 self._anchors.own[found.anchors], self._anchors.landmark[found.anchors],
                 uncertainty.landmark_lever,
             )  # fmt: skip
@@ -288,12 +289,12 @@ class _Tracker:
             n_tried,
             n,
             True,
-            float(np.sqrt(information[-1, 0] / n)),
+            float(np.sqrt(squared_px / n)),
             # Those that were not tried would fare like those that were.
             round(in_view * n / n_tried),
-            covered_share(found.pixels[agrees > 0], self._camera),
+            covered_share(found.pixels[agrees], self._camera),
             "patches",
-            self._novelty_deg(found.anchors[agrees > 0], pose),
+            self._novelty_deg(found.anchors[agrees], pose),
         )
         return believed(fix, ned_from_body, self._belief)
 

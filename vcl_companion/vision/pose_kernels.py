@@ -1,7 +1,18 @@
 """The refinement of a pose over many sightings, compiled (eq. 4).
 
-What ``vision.resection`` does in arrays of all sightings, in one loop, for as
-many sightings as patches give: same weights, same steps, same pose.
+What ``vision.resection`` does in arrays of all sightings, in loops, for as many
+sightings as patches give: same weights, same steps, same pose.
+
+Sightings are laid out in blocks of ``_BLOCK``, number by number: first one number
+of each of them, then the next number, so that the compiler takes several at once.
+What is behind the last one is zero, and is no sighting.
+
+  sighted (_N_SIGHTED * _BLOCK,): ideal x, y; slopes of the lens (4); point (3); its covariance
+    xx xy xz yy yz zz; that of the pixel xx xy yy; 1, or 0 for none
+  whitened (_N_WHITENED * _BLOCK,), errors in units of their sigma, what is first and what else
+    is second by Cholesky's root G of a residual's covariance, of which residual = G whitened:
+    the first by the pose (6), the first itself; the second likewise (7); the first by the
+    point (3), the second (3); G's xx, yx, yy; the squared length; the weight
 """
 
 from __future__ import annotations
@@ -12,10 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision.compiled import compiled
+from vcl_companion.vision.compiled import compiled, reordered
 
 Ints = NDArray[np.int64]
 
+_BLOCK = 64
+_N_SIGHTED, _N_WHITENED = 19, 25
+_IDEAL, _SLOPES, _POINT, _SPREAD, _PIXEL, _IS = (_BLOCK * k for k in (0, 2, 6, 9, 15, 18))
+_FIRST, _SECOND, _BY_POINT, _ROOT, _SQUARED, _WEIGHT = (_BLOCK * k for k in (0, 7, 14, 20, 23, 24))
 _MIN_DEPTH_M = 1e-3
 # What is left of a diagonal's element by elimination, as a share of it, that is no rounding.
 _LEAST_PIVOT = 1e-13
@@ -52,38 +67,22 @@ def converged(
     """
     start = pose.copy()
     now = pose.copy()
-    residual, j_pose, j_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
-    weighted = np.empty((2, 6))
-    information = np.empty(3)
-    normal, rhs, step = np.empty((6, 6)), np.empty(6), np.empty(6)
+    blocks = _laid_out(ideal, slopes, points, point_covariances, pixel_covariances)
+    whitened = np.empty(_N_WHITENED * _BLOCK)
+    sums, step = np.empty((7, 7)), np.empty(6)
     for k in range(len(scales)):
         scale = scales[k]
         for _ in range(4):
-            normal[:] = 0.0
-            rhs[:] = 0.0
+            sums[:] = 0.0
             if prior_information[0, 0] > 0.0:
-                normal += prior_information
-                rhs -= prior_information @ _local(start, now)
-            for i in range(len(points)):
-                if not linearized_at(
-                    now, body_from_cam, ideal[i], slopes[i], points[i], residual, j_pose, j_point
-                ):
-                    continue
-                squared = informed(
-                    residual, j_point, point_covariances[i], pixel_covariances[i], information
-                ) / (scale * scale)
-                weight = 1.0 / ((1.0 + squared / 4.0) ** 2 * scale * scale)
-                xx, xy, yy = information[0], information[1], information[2]
-                for c in range(6):
-                    weighted[0, c] = weight * (xx * j_pose[0, c] + xy * j_pose[1, c])
-                    weighted[1, c] = weight * (xy * j_pose[0, c] + yy * j_pose[1, c])
-                for c in range(6):
-                    for d in range(c + 1):
-                        normal[c, d] += (
-                            weighted[0, c] * j_pose[0, d] + weighted[1, c] * j_pose[1, d]
-                        )
-                    rhs[c] -= weighted[0, c] * residual[0] + weighted[1, c] * residual[1]
-            if not _solved(normal, rhs, step):
+                sums[:6, :6] = prior_information
+                sums[6, :6] = prior_information @ _local(start, now)
+            # Not one after the other: numba would not know that each lies without gaps.
+            for b in range(len(blocks)):
+                _whiten(now, body_from_cam, blocks[b], whitened)
+                _weigh(blocks[b], whitened, scale, np.inf)
+                _add_up(whitened, sums)
+            if not _solved(sums, step):
                 return now, SINGULAR
             length = math.sqrt(float((step * step).sum()))
             if not length < 1e3:
@@ -104,7 +103,7 @@ def supported(
     point_covariances: Array,
     pixel_covariances: Array,
     largest: float,
-) -> tuple[Ints, Array, Array, Array, Array]:
+) -> tuple[NDArray[np.bool_], Array, Array, Array, Array, Array, float]:
     """Find who agrees with a pose.
 
     Args:
@@ -118,206 +117,219 @@ def supported(
         largest: squared Mahalanobis length of a residual that still agrees.
 
     Returns:
-        (M,) 1 for those that agree; (6, 6) their normal matrix; (M, 2, 6) and (M, 2, 3)
-        residuals by pose and by point; (M + 1, 3) their weighted informations xx xy yy,
-        and in one more row the sum of squared residuals, px^2.
+        (M,) who agrees; (6, 6) their normal matrix; (2, 6, M) and (2, 3, M) whitened residuals
+        by pose and by point, (3, M) the roots of their covariances, xx yx yy, px, and (M,)
+        their weights, zero for those who do not agree; the sum of squared residuals of those
+        who do, px^2.
     """
     m = len(points)
-    agrees, normal = np.zeros(m, np.int64), np.zeros((6, 6))
-    j_poses, j_points = np.zeros((m, 2, 6)), np.zeros((m, 2, 3))
-    informations = np.zeros((m + 1, 3))
-    residual, information = np.empty(2), np.empty(3)
-    for i in range(m):
-        if not linearized_at(
-            pose, body_from_cam, ideal[i], slopes[i], points[i], residual, j_poses[i], j_points[i]
-        ):
-            continue
-        squared = informed(
-            residual, j_points[i], point_covariances[i], pixel_covariances[i], information
-        )
-        if not squared < largest:
-            continue
-        agrees[i] = 1
-        informations[m, 0] += residual[0] ** 2 + residual[1] ** 2
-        weight = 1.0 / (1.0 + squared / 4.0) ** 2
+    agrees, weights = np.zeros(m, np.bool_), np.empty(m)
+    j_poses, j_points, roots = np.empty((2, 6, m)), np.empty((2, 3, m)), np.empty((3, m))
+    blocks = _laid_out(ideal, slopes, points, point_covariances, pixel_covariances)
+    whitened = np.empty(_N_WHITENED * _BLOCK)
+    sums, squared_px = np.zeros((7, 7)), 0.0
+    for k in range(len(blocks)):
+        _whiten(pose, body_from_cam, blocks[k], whitened)
+        _weigh(blocks[k], whitened, 1.0, largest)
+        _add_up(whitened, sums)
+        begin = k * _BLOCK
+        n = min(_BLOCK, m - begin)
+        for row in range(2):
+            for c in range(6):
+                at = (_SECOND if row else _FIRST) + c * _BLOCK
+                j_poses[row, c, begin : begin + n] = whitened[at : at + n]
+            for c in range(3):
+                at = _BY_POINT + (3 * row + c) * _BLOCK
+                j_points[row, c, begin : begin + n] = whitened[at : at + n]
         for c in range(3):
-            informations[i, c] = weight * information[c]
-        xx, xy, yy = informations[i, 0], informations[i, 1], informations[i, 2]
-        j = j_poses[i]
-        for c in range(6):
-            left, right = xx * j[0, c] + xy * j[1, c], xy * j[0, c] + yy * j[1, c]
-            for d in range(c + 1):
-                normal[c, d] += left * j[0, d] + right * j[1, d]
+            at = _ROOT + c * _BLOCK
+            roots[c, begin : begin + n] = whitened[at : at + n]
+        weights[begin : begin + n] = whitened[_WEIGHT : _WEIGHT + n]
+        for i in range(n):
+            if not whitened[_SQUARED + i] < largest:
+                continue
+            agrees[begin + i] = True
+            u, v = whitened[_FIRST + 6 * _BLOCK + i], whitened[_SECOND + 6 * _BLOCK + i]
+            x = whitened[_ROOT + i] * u
+            y = whitened[_ROOT + _BLOCK + i] * u + whitened[_ROOT + 2 * _BLOCK + i] * v
+            squared_px += x * x + y * y
+    normal = sums[:6, :6].copy()
     for c in range(6):
         for d in range(c):
             normal[d, c] = normal[c, d]
-    return agrees, normal, j_poses, j_points, informations
+    return agrees, normal, j_poses, j_points, roots, weights, squared_px
 
 
 @compiled
-def gained(
-    agrees: Ints,
-    inverse: Array,
-    j_poses: Array,
-    j_points: Array,
-    informations: Array,
-    noises: Array,
-    misplaced: Array,
-    owns: Array,
-    landmarks: Ints,
-    levers: NDArray[np.float32],
-) -> tuple[Array, Array, Array]:
-    """Carry the errors of everything that fixed a pose over to it (eq. 12, and the map's).
-
-    Args:
-        agrees: (M,) of ``supported``, like the three after the inverse.
-        inverse: (6, 6) of its normal matrix.
-        j_poses: (M, 2, 6).
-        j_points: (M, 2, 3).
-        informations: (M + 1, 3).
-        noises: (M, 3) xx xy yy of each pixel, new in every frame, px^2.
-        misplaced: (M, 3) the same of what is alike in every frame, px^2.
-        owns: (M, 3) 1-sigma displacement of each landmark by its own depth, world, m.
-        landmarks: (M,) rows of ``levers``.
-        levers: (N, 3, K) landmark error per keyframe error.
-
-    Returns:
-        (M,) leverage of each; (3, 6, 6) covariance by pixel noise, by misplacement, by the
-        landmarks' own errors; (6, K) lever of the keyframes.
-    """
-    m, k = len(agrees), levers.shape[2]
-    leverage, covariances, lever = np.zeros(m), np.zeros((3, 6, 6)), np.zeros((6, k))
-    gain, by_point = np.empty((6, 2)), np.empty((6, 3))
-    depth = np.empty(6)
-    for i in range(m):
-        if agrees[i] == 0:
-            continue
-        j = j_poses[i]
-        xx, xy, yy = informations[i, 0], informations[i, 1], informations[i, 2]
-        for c in range(6):
-            a, b = 0.0, 0.0
-            for d in range(6):
-                a += inverse[c, d] * j[0, d]
-                b += inverse[c, d] * j[1, d]
-            gain[c, 0], gain[c, 1] = a * xx + b * xy, a * xy + b * yy
-        oxx, oxy, oyx, oyy = 0.0, 0.0, 0.0, 0.0
-        for c in range(6):
-            oxx += j[0, c] * gain[c, 0]
-            oxy += j[0, c] * gain[c, 1]
-            oyx += j[1, c] * gain[c, 0]
-            oyy += j[1, c] * gain[c, 1]
-        half, det = 0.5 * (oxx + oyy), oxx * oyy - oxy * oyx
-        leverage[i] = half + math.sqrt(max(half * half - det, 0.0))
-        landmark = landmarks[i]
-        for c in range(6):
-            depth[c] = 0.0
-            for r in range(3):
-                by_point[c, r] = -(gain[c, 0] * j_points[i, 0, r] + gain[c, 1] * j_points[i, 1, r])
-                depth[c] += by_point[c, r] * owns[i, r]
-                for d in range(k):
-                    lever[c, d] += by_point[c, r] * levers[landmark, r, d]
-        for c in range(6):
-            g0, g1 = gain[c, 0], gain[c, 1]
-            n0, n1 = g0 * noises[i, 0] + g1 * noises[i, 1], g0 * noises[i, 1] + g1 * noises[i, 2]
-            b0 = g0 * misplaced[i, 0] + g1 * misplaced[i, 1]
-            b1 = g0 * misplaced[i, 1] + g1 * misplaced[i, 2]
-            for d in range(c + 1):
-                covariances[0, c, d] += n0 * gain[d, 0] + n1 * gain[d, 1]
-                covariances[1, c, d] += b0 * gain[d, 0] + b1 * gain[d, 1]
-                covariances[2, c, d] += depth[c] * depth[d]
-    for part in range(3):
-        for c in range(6):
-            for d in range(c):
-                covariances[part, d, c] = covariances[part, c, d]
-    return leverage, covariances, lever
-
-
-@compiled
-def linearized_at(
-    pose: Array,
-    body_from_cam: Array,
-    ideal: Array,
-    slope: Array,
-    point: Array,
-    residual: Array,
-    j_pose: Array,
-    j_point: Array,
-) -> bool:
-    """Fill one residual, px, and its Jacobians (``bundle.linearized``); False behind the camera."""
-    d0, d1, d2 = point[0] - pose[0, 3], point[1] - pose[1, 3], point[2] - pose[2, 3]
-    p = (
-        pose[0, 0] * d0 + pose[1, 0] * d1 + pose[2, 0] * d2,
-        pose[0, 1] * d0 + pose[1, 1] * d1 + pose[2, 1] * d2,
-        pose[0, 2] * d0 + pose[1, 2] * d1 + pose[2, 2] * d2,
-    )
-    b0, b1, b2 = p[0] - body_from_cam[0, 3], p[1] - body_from_cam[1, 3], p[2] - body_from_cam[2, 3]
-    z = body_from_cam[0, 2] * b0 + body_from_cam[1, 2] * b1 + body_from_cam[2, 2] * b2
-    if not z > _MIN_DEPTH_M:
-        return False
-    x = (body_from_cam[0, 0] * b0 + body_from_cam[1, 0] * b1 + body_from_cam[2, 0] * b2) / z
-    y = (body_from_cam[0, 1] * b0 + body_from_cam[1, 1] * b1 + body_from_cam[2, 1] * b2) / z
-    dx, dy = x - ideal[0], y - ideal[1]
-    for r in range(2):
-        sx, sy = slope[r, 0], slope[r, 1]
-        residual[r] = sx * dx + sy * dy
-        c0, c1, c2 = sx / z, sy / z, -(sx * x + sy * y) / z
-        g0 = c0 * body_from_cam[0, 0] + c1 * body_from_cam[0, 1] + c2 * body_from_cam[0, 2]
-        g1 = c0 * body_from_cam[1, 0] + c1 * body_from_cam[1, 1] + c2 * body_from_cam[1, 2]
-        g2 = c0 * body_from_cam[2, 0] + c1 * body_from_cam[2, 1] + c2 * body_from_cam[2, 2]
-        j_pose[r, 0], j_pose[r, 1], j_pose[r, 2] = -g0, -g1, -g2
-        j_pose[r, 3] = g1 * p[2] - g2 * p[1]
-        j_pose[r, 4] = g2 * p[0] - g0 * p[2]
-        j_pose[r, 5] = g0 * p[1] - g1 * p[0]
+def _laid_out(
+    ideal: Array, slopes: Array, points: Array, point_covariances: Array, pixel_covariances: Array
+) -> Array:
+    """Return (ceil(M / _BLOCK), _N_SIGHTED * _BLOCK) sightings, see the module."""
+    m = len(points)
+    out = np.zeros(((m + _BLOCK - 1) // _BLOCK, _N_SIGHTED * _BLOCK))
+    # None has slopes of zero, so it says nothing; but it has a covariance.
+    out[:, _PIXEL : _PIXEL + _BLOCK] = 1.0
+    out[:, _PIXEL + 2 * _BLOCK : _PIXEL + 3 * _BLOCK] = 1.0
+    for j in range(m):
+        block, i = out[j // _BLOCK], j % _BLOCK
+        for c in range(2):
+            block[_IDEAL + c * _BLOCK + i] = ideal[j, c]
+            block[_SLOPES + c * _BLOCK + i] = slopes[j, 0, c]
+            block[_SLOPES + (2 + c) * _BLOCK + i] = slopes[j, 1, c]
         for c in range(3):
-            j_point[r, c] = g0 * pose[c, 0] + g1 * pose[c, 1] + g2 * pose[c, 2]
-    return True
+            block[_POINT + c * _BLOCK + i] = points[j, c]
+            block[_PIXEL + c * _BLOCK + i] = pixel_covariances[j, c]
+        for c in range(6):
+            block[_SPREAD + c * _BLOCK + i] = point_covariances[j, c]
+        block[_IS + i] = 1.0
+    return out
+
+
+@reordered
+def _whiten(pose: Array, body_from_cam: Array, sighted: Array, out: Array) -> None:
+    """Fill all but the weights of a block, see the module; behind the camera it is infinitely off.
+
+    The derivatives are those of ``bundle.linearized``.
+    """
+    r00, r01, r02, t0 = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
+    r10, r11, r12, t1 = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
+    r20, r21, r22, t2 = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
+    m = body_from_cam
+    m00, m01, m02, m03 = m[0, 0], m[0, 1], m[0, 2], m[0, 3]
+    m10, m11, m12, m13 = m[1, 0], m[1, 1], m[1, 2], m[1, 3]
+    m20, m21, m22, m23 = m[2, 0], m[2, 1], m[2, 2], m[2, 3]
+    for i in range(_BLOCK):
+        d0 = sighted[_POINT + i] - t0
+        d1 = sighted[_POINT + _BLOCK + i] - t1
+        d2 = sighted[_POINT + 2 * _BLOCK + i] - t2
+        # In body axes, then from the camera.
+        p0 = r00 * d0 + r10 * d1 + r20 * d2
+        p1 = r01 * d0 + r11 * d1 + r21 * d2
+        p2 = r02 * d0 + r12 * d1 + r22 * d2
+        b0, b1, b2 = p0 - m03, p1 - m13, p2 - m23
+        depth = m02 * b0 + m12 * b1 + m22 * b2
+        is_ahead = depth > _MIN_DEPTH_M
+        z = depth if is_ahead else 1.0
+        x = (m00 * b0 + m10 * b1 + m20 * b2) / z
+        y = (m01 * b0 + m11 * b1 + m21 * b2) / z
+        dx, dy = x - sighted[_IDEAL + i], y - sighted[_IDEAL + _BLOCK + i]
+        # By the point: the column u, in camera, body and world axes, then the row v.
+        sx, sy = sighted[_SLOPES + i] / z, sighted[_SLOPES + _BLOCK + i] / z
+        s = -(sx * x + sy * y)
+        u0, u1, u2 = m00 * sx + m01 * sy, m10 * sx + m11 * sy, m20 * sx + m21 * sy
+        u0, u1, u2 = u0 + m02 * s, u1 + m12 * s, u2 + m22 * s
+        u_off = (sx * dx + sy * dy) * z
+        uw0 = r00 * u0 + r01 * u1 + r02 * u2
+        uw1 = r10 * u0 + r11 * u1 + r12 * u2
+        uw2 = r20 * u0 + r21 * u1 + r22 * u2
+        sx, sy = sighted[_SLOPES + 2 * _BLOCK + i] / z, sighted[_SLOPES + 3 * _BLOCK + i] / z
+        s = -(sx * x + sy * y)
+        v0, v1, v2 = m00 * sx + m01 * sy, m10 * sx + m11 * sy, m20 * sx + m21 * sy
+        v0, v1, v2 = v0 + m02 * s, v1 + m12 * s, v2 + m22 * s
+        v_off = (sx * dx + sy * dy) * z
+        vw0 = r00 * v0 + r01 * v1 + r02 * v2
+        vw1 = r10 * v0 + r11 * v1 + r12 * v2
+        vw2 = r20 * v0 + r21 * v1 + r22 * v2
+        # The residual's covariance, its root, and what that leaves of everything.
+        cxx, cxy = sighted[_SPREAD + i], sighted[_SPREAD + _BLOCK + i]
+        cxz, cyy = sighted[_SPREAD + 2 * _BLOCK + i], sighted[_SPREAD + 3 * _BLOCK + i]
+        cyz, czz = sighted[_SPREAD + 4 * _BLOCK + i], sighted[_SPREAD + 5 * _BLOCK + i]
+        k0 = cxx * uw0 + cxy * uw1 + cxz * uw2
+        k1 = cxy * uw0 + cyy * uw1 + cyz * uw2
+        k2 = cxz * uw0 + cyz * uw1 + czz * uw2
+        xx = sighted[_PIXEL + i] + uw0 * k0 + uw1 * k1 + uw2 * k2
+        xy = sighted[_PIXEL + _BLOCK + i] + vw0 * k0 + vw1 * k1 + vw2 * k2
+        yy = sighted[_PIXEL + 2 * _BLOCK + i] + (
+            cxx * vw0 * vw0 + cyy * vw1 * vw1 + czz * vw2 * vw2
+            + 2.0 * (cxy * vw0 * vw1 + cxz * vw0 * vw2 + cyz * vw1 * vw2)
+        )  # fmt: skip
+        g = math.sqrt(xx)
+        mixed = xy / g
+        h = math.sqrt(max(yy - mixed * mixed, _LEAST_PIVOT * yy))
+        first, second = 1.0 / g, 1.0 / h
+        u0, u1, u2, u_off = u0 * first, u1 * first, u2 * first, u_off * first
+        v0, v1, v2 = (
+            (v0 - mixed * u0) * second,
+            (v1 - mixed * u1) * second,
+            (v2 - mixed * u2) * second,
+        )
+        v_off = (v_off - mixed * u_off) * second
+        uw0, uw1, uw2 = uw0 * first, uw1 * first, uw2 * first
+        out[_FIRST + i], out[_FIRST + _BLOCK + i], out[_FIRST + 2 * _BLOCK + i] = -u0, -u1, -u2
+        out[_FIRST + 3 * _BLOCK + i] = u1 * p2 - u2 * p1
+        out[_FIRST + 4 * _BLOCK + i] = u2 * p0 - u0 * p2
+        out[_FIRST + 5 * _BLOCK + i] = u0 * p1 - u1 * p0
+        out[_FIRST + 6 * _BLOCK + i] = u_off
+        out[_SECOND + i], out[_SECOND + _BLOCK + i], out[_SECOND + 2 * _BLOCK + i] = -v0, -v1, -v2
+        out[_SECOND + 3 * _BLOCK + i] = v1 * p2 - v2 * p1
+        out[_SECOND + 4 * _BLOCK + i] = v2 * p0 - v0 * p2
+        out[_SECOND + 5 * _BLOCK + i] = v0 * p1 - v1 * p0
+        out[_SECOND + 6 * _BLOCK + i] = v_off
+        out[_BY_POINT + i] = uw0
+        out[_BY_POINT + _BLOCK + i] = uw1
+        out[_BY_POINT + 2 * _BLOCK + i] = uw2
+        out[_BY_POINT + 3 * _BLOCK + i] = (vw0 - mixed * uw0) * second
+        out[_BY_POINT + 4 * _BLOCK + i] = (vw1 - mixed * uw1) * second
+        out[_BY_POINT + 5 * _BLOCK + i] = (vw2 - mixed * uw2) * second
+        out[_ROOT + i], out[_ROOT + _BLOCK + i], out[_ROOT + 2 * _BLOCK + i] = g, mixed, h
+        squared = u_off * u_off + v_off * v_off
+        out[_SQUARED + i] = squared if is_ahead else np.inf
 
 
 @compiled
-def informed(
-    residual: Array, j_point: Array, point_covariance: Array, pixel_covariance: Array, out: Array
-) -> float:
-    """Fill xx, xy, yy of a residual's information; return its squared Mahalanobis length."""
-    xx, xy, yy = pixel_covariance[0], pixel_covariance[1], pixel_covariance[2]
-    m = point_covariance
-    x0, x1, x2 = j_point[0, 0], j_point[0, 1], j_point[0, 2]
-    y0, y1, y2 = j_point[1, 0], j_point[1, 1], j_point[1, 2]
-    mx0 = m[0] * x0 + m[1] * x1 + m[2] * x2
-    mx1 = m[1] * x0 + m[3] * x1 + m[4] * x2
-    mx2 = m[2] * x0 + m[4] * x1 + m[5] * x2
-    xx += x0 * mx0 + x1 * mx1 + x2 * mx2
-    xy += y0 * mx0 + y1 * mx1 + y2 * mx2
-    yy += (
-        m[0] * y0 * y0 + m[3] * y1 * y1 + m[5] * y2 * y2
-        + 2.0 * (m[1] * y0 * y1 + m[2] * y0 * y2 + m[4] * y1 * y2)
-    )  # fmt: skip
-    determinant = xx * yy - xy * xy
-    out[0], out[1], out[2] = yy / determinant, -xy / determinant, xx / determinant
-    a, b = residual[0], residual[1]
-    return float(out[0] * a * a + 2.0 * out[1] * a * b + out[2] * b * b)
+def _weigh(sighted: Array, whitened: Array, scale: float, largest: float) -> None:
+    """Fill the weights of a block: redescending, of a noise so many times larger."""
+    precision = 1.0 / (scale * scale)
+    for i in range(_BLOCK):
+        squared = whitened[_SQUARED + i]
+        far = 1.0 + 0.25 * precision * squared
+        weight = sighted[_IS + i] * precision / (far * far)
+        whitened[_WEIGHT + i] = weight if squared < largest else 0.0
+
+
+@reordered
+def _add_up(whitened: Array, sums: Array) -> None:
+    """Add a block's products to (7, 7) of the pose's six with each other and with the residual.
+
+    Only the lower half.
+    """
+    first, second = np.empty(_BLOCK), np.empty(_BLOCK)
+    weights = whitened[_WEIGHT : _WEIGHT + _BLOCK]
+    for c in range(7):
+        a = whitened[_FIRST + c * _BLOCK : _FIRST + (c + 1) * _BLOCK]
+        b = whitened[_SECOND + c * _BLOCK : _SECOND + (c + 1) * _BLOCK]
+        for i in range(_BLOCK):
+            first[i], second[i] = weights[i] * a[i], weights[i] * b[i]
+        for d in range(c + 1):
+            a = whitened[_FIRST + d * _BLOCK : _FIRST + (d + 1) * _BLOCK]
+            b = whitened[_SECOND + d * _BLOCK : _SECOND + (d + 1) * _BLOCK]
+            total = 0.0
+            for i in range(_BLOCK):
+                total += first[i] * a[i] + second[i] * b[i]
+            sums[c, d] += total
 
 
 @compiled
-def _solved(normal: Array, rhs: Array, step: Array) -> bool:
-    """Fill the solution of (6, 6) normal equations by Cholesky; False where there is none.
+def _solved(sums: Array, step: Array) -> bool:
+    """Fill the solution of normal equations (``_add_up``) by Cholesky; False where there is none.
 
     LAPACK's solver would raise, in the middle of a frame.
     """
     root = np.zeros((6, 6))
     for c in range(6):
-        left = normal[c, c]
+        left = sums[c, c]
         for k in range(c):
             left -= root[c, k] ** 2
-        if not left > _LEAST_PIVOT * normal[c, c]:
+        if not left > _LEAST_PIVOT * sums[c, c]:
             return False
         root[c, c] = math.sqrt(left)
         for d in range(c + 1, 6):
-            below = normal[d, c]
+            below = sums[d, c]
             for k in range(c):
                 below -= root[d, k] * root[c, k]
             root[d, c] = below / root[c, c]
     for c in range(6):
-        step[c] = rhs[c]
+        step[c] = -sums[6, c]
         for k in range(c):
             step[c] -= root[c, k] * step[k]
         step[c] /= root[c, c]

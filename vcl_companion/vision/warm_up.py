@@ -11,7 +11,7 @@ import numpy as np
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision import pose_kernels
+from vcl_companion.vision import pose_errors, pose_kernels
 from vcl_companion.vision.absolute_pose import resect
 from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust, point_information
 from vcl_companion.vision.features import Features
@@ -106,13 +106,13 @@ def _track(rng: np.random.Generator) -> None:
     )
     pose_kernels.converged(pose, pose, *system, np.zeros((6, 6)), np.ones(1))
     supported = pose_kernels.supported(pose, pose, *system, 18.4)
-    agrees, _, j_pose, j_point, information = supported
-    pose_kernels.gained(
-        agrees,
+    _, _, j_poses, j_points, roots, weights, _ = supported
+    pose_errors.gained(
         np.eye(6),
-        j_pose,
-        j_point,
-        information,
+        j_poses,
+        j_points,
+        roots,
+        weights,
         found.noise,
         found.misplaced,
         anchors.own[rows],
