@@ -10,6 +10,7 @@ from vcl_companion.geometry.rotation import Array
 _COLUMNS, _ROWS = 8, 6
 # A patch bears a turn of so many degrees as well as being seen twice as large or small.
 _OCTAVE_DEG = 15.0
+_LEAST_M = 1e-9
 
 
 def novelty_deg(points: Array, now: Array, then: Array) -> float:
@@ -25,11 +26,11 @@ def novelty_deg(points: Array, now: Array, then: Array) -> float:
         a doubling or halving of the distance counts like 15 degrees.
     """
     ray, before = points - now, points - then
-    length = np.maximum(np.linalg.norm(ray, axis=1), 1e-9)
-    length_then = np.maximum(np.linalg.norm(before, axis=1), 1e-9)
-    cosine = np.einsum("mi,mi->m", ray, before) / (length * length_then)
-    angle_deg = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    octaves = np.log2(length / length_then)
+    squared = np.maximum(np.einsum("mi,mi->m", ray, ray), _LEAST_M**2)
+    squared_then = np.maximum(np.einsum("mi,mi->m", before, before), _LEAST_M**2)
+    cosine = np.einsum("mi,mi->m", ray, before) / np.sqrt(squared * squared_then)
+    angle_deg = np.rad2deg(np.arccos(np.minimum(np.maximum(cosine, -1.0), 1.0)))
+    octaves = 0.5 * np.log2(squared / squared_then)
     return float(np.median(np.hypot(angle_deg, _OCTAVE_DEG * octaves)))
 
 
@@ -45,4 +46,4 @@ def covered_share(pixels: Array, camera: Camera) -> float:
     row = (pixels[:, 1] + 0.5) * _ROWS / camera.height_px
     inside = (column >= 0) & (column < _COLUMNS) & (row >= 0) & (row < _ROWS)
     parts = row[inside].astype(np.intp) * _COLUMNS + column[inside].astype(np.intp)
-    return len(np.unique(parts)) / (_COLUMNS * _ROWS)
+    return int(np.count_nonzero(np.bincount(parts))) / (_COLUMNS * _ROWS)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.intra import NotLocalized, Prior
-from vcl_companion.vision.patches import Alignment, Anchors
+from vcl_companion.vision.patches import Alignment
 from vcl_companion.vision.pose_kernels import CONVERGED, converged, supported
 
 _CHI2_2_99 = 9.21
@@ -29,13 +29,11 @@ class PatchPoses:
     """Poses from the patches of one camera.
 
     Attributes:
-        anchors: of the map.
         body_from_cam: the camera's mounting.
         size_px: width and height of its image.
         min_inliers: landmarks that must agree.
     """
 
-    anchors: Anchors
     body_from_cam: Pose
     size_px: tuple[int, int]
     min_inliers: int
@@ -116,7 +114,7 @@ class PatchPoses:
             np.ascontiguousarray(self.body_from_cam.matrix()[:3]),
             found.ideal,
             found.slopes,
-            self.anchors.points_world[found.anchors],
-            self.anchors.spread[found.anchors],
+            found.points_world,
+            found.spread,
             found.noise + found.misplaced,
         )

@@ -161,7 +161,7 @@ class _Tracker:
         self._options = options
         self._belief = belief
         size_px = (camera.width_px, camera.height_px)
-        self._poses = PatchPoses(self._anchors, body_from_cam, size_px, belief.min_inliers)
+        self._poses = PatchPoses(body_from_cam, size_px, belief.min_inliers)
 
     def located(self, prior: Prior, ned_from_body: Array | None) -> Localized | NotLocalized:
         options = self._options
@@ -169,7 +169,9 @@ class _Tracker:
         rows, radii, in_view = self._choose(prior)
         if len(rows) < self._belief.min_inliers:
             return NotLocalized(f"{len(rows)} landmarks in view, {self._belief.min_inliers} needed")
-        radius = float(np.quantile(radii, 0.75))
+        # Three quarters of them are nearer.
+        at = (3 * len(radii)) // 4
+        radius = float(np.partition(radii, at)[at])
         if radius > options.max_radius_px:
             return NotLocalized(f"the prediction is {radius:.0f} px uncertain")
         if radius > 1.5:
@@ -193,9 +195,15 @@ class _Tracker:
             numbers = [self._poses.n_agreeing(*one) for one in zip(looks, rivals, strict=True)]
             best = int(np.argmax(numbers))
             found, refined = looks[best], rivals[best]
-        elif float(np.median(np.abs(found.pixels - found.predicted))) > _WELL_PREDICTED_PX:
+        elif self._is_ill_predicted(found):
             found = self._aligned(rows, refined, np.zeros(len(rows)), 0, options.least_score)
         return self._judged(found, refined, len(rows), in_view, ned_from_body)
+
+    @staticmethod
+    def _is_ill_predicted(found: Alignment) -> bool:
+        """Whether half of the patches were farther than hoped from where they were expected."""
+        moved = np.abs(found.pixels - found.predicted)
+        return bool(2 * np.count_nonzero(moved > _WELL_PREDICTED_PX) > moved.size)
 
     def _choose(self, prior: Prior) -> tuple[NDArray[np.int64], Array, int]:
         return choose_anchors(
@@ -306,7 +314,7 @@ class _Tracker:
         )
 
     def _novelty_deg(self, anchors: NDArray[np.int64], pose: Pose) -> float:
-        centres = np.stack([p.translation for p in self._anchors.images.worlds_from_cams])
+        centres = self._anchors.images.centres
         return novelty_deg(
             self._anchors.points_world[anchors],
             (pose @ self._mounting).translation,

@@ -84,7 +84,8 @@ def seen_from(plane: Array, lens: Array, reach: float, transform: Array, out: Ar
     q2 = transform[2, 0] * x + transform[2, 1] * y + transform[2, 2] + transform[2, 3] * r
     if not (q2 > 1e-3 and r > 1e-6):
         return False
-    ideal_x, ideal_y = q0 / q2, q1 / q2
+    nearness = 1.0 / q2
+    ideal_x, ideal_y = q0 * nearness, q1 * nearness
     if not ideal_x * ideal_x + ideal_y * ideal_y < reach:
         return False
     u, v, ux, uy, vx, vy = bent(lens, ideal_x, ideal_y)
@@ -92,12 +93,12 @@ def seen_from(plane: Array, lens: Array, reach: float, transform: Array, out: Ar
     q0x, q0y = transform[0, 0] + transform[0, 3] * b, transform[0, 1] + transform[0, 3] * c
     q1x, q1y = transform[1, 0] + transform[1, 3] * b, transform[1, 1] + transform[1, 3] * c
     q2x, q2y = transform[2, 0] + transform[2, 3] * b, transform[2, 1] + transform[2, 3] * c
-    hxx, hxy = (q0x - ideal_x * q2x) / q2, (q0y - ideal_x * q2y) / q2
-    hyx, hyy = (q1x - ideal_y * q2x) / q2, (q1y - ideal_y * q2y) / q2
+    hxx, hxy = (q0x - ideal_x * q2x) * nearness, (q0y - ideal_x * q2y) * nearness
+    hyx, hyy = (q1x - ideal_y * q2x) * nearness, (q1y - ideal_y * q2y) * nearness
     ixx, ixy, iyx, iyy = plane[5], plane[6], plane[7], plane[8]
     mxx, mxy = ux * hxx + uy * hyx, ux * hxy + uy * hyy
     myx, myy = vx * hxx + vy * hyx, vx * hxy + vy * hyy
-    out[0], out[1], out[2], out[3], out[4] = ideal_x, ideal_y, r / q2, u, v
+    out[0], out[1], out[2], out[3], out[4] = ideal_x, ideal_y, r * nearness, u, v
     out[5], out[6], out[7], out[8] = ux, uy, vx, vy
     out[9], out[10] = mxx * ixx + mxy * iyx, mxx * ixy + mxy * iyy
     out[11], out[12] = myx * ixx + myy * iyx, myx * ixy + myy * iyy
@@ -106,9 +107,20 @@ def seen_from(plane: Array, lens: Array, reach: float, transform: Array, out: Ar
     weight = (gx * ideal_x + gy * ideal_y + g1) * (ux * vy - uy * vx)
     if not abs(weight) > 1e-12:
         return False
-    out[13], out[14] = (vy * gx - vx * gy) / weight, (ux * gy - uy * gx) / weight
+    share = 1.0 / weight
+    out[13], out[14] = (vy * gx - vx * gy) * share, (ux * gy - uy * gx) * share
     # A patch seen from behind, or edge on, says nothing.
     return bool(out[9] * out[12] - out[10] * out[11] > 1e-3)
+
+
+@compiled
+def _is_in_view(plane: Array, reach: float, transform: Array) -> bool:
+    """Whether a point is before the camera, and not clearly farther out than the lens shows."""
+    x, y, r = plane[0], plane[1], plane[2]
+    q0 = transform[0, 0] * x + transform[0, 1] * y + transform[0, 2] + transform[0, 3] * r
+    q1 = transform[1, 0] * x + transform[1, 1] * y + transform[1, 2] + transform[1, 3] * r
+    q2 = transform[2, 0] * x + transform[2, 1] * y + transform[2, 2] + transform[2, 3] * r
+    return bool(q2 > 0.0 and q0 * q0 + q1 * q1 < 1.01 * reach * q2 * q2)
 
 
 @compiled
@@ -240,16 +252,14 @@ def choose(
     total = np.zeros((6, 6))
     columns, rows = int(image[0] / rules[0]) + 1, int(image[1] / rules[0]) + 1
     margin = image[2]
+    centres = _seen_from_keys(transforms)
     count = 0
     for j in range(n):
-        best, least = -1, np.inf
-        for a in range(first[j], first[j + 1]):
-            half_angle, octaves = change_of_view(planes[a], transforms[keyframe[a]])
-            if octaves > rules[5] or octaves < -rules[6] or half_angle > 0.7:
-                continue
-            change2 = (2.0 * rules[3] * half_angle) ** 2 + (rules[4] * octaves) ** 2
-            if change2 < least:
-                best, least = a, change2
+        # All anchors of a landmark are of the same point: most of a map is not in view.
+        a = first[j]
+        if a == first[j + 1] or not _is_in_view(planes[a], reach, transforms[keyframe[a]]):
+            continue
+        best, least = _most_alike(first[j], first[j + 1], planes, keyframe, centres, rules)
         if best < 0:
             continue
         if not seen_from(planes[best], lens, reach, transforms[keyframe[best]], view):
@@ -326,8 +336,7 @@ def choose(
         taken[cells[i]] += 1
     size = min(wanted, count)
     chosen, radii = np.empty(size, np.int64), np.empty(size)
-    # The best of every cell first, then the second best...: a stable sort keeps their order.
-    turns = order[np.argsort(rank[order], kind="mergesort")]
+    turns = _in_turns(order, rank, size)
     for k in range(size):
         i = turns[k]
         chosen[k] = anchors[i]
@@ -340,6 +349,61 @@ def choose(
         # The larger axis of it holds at most all of it.
         radii[k] = 3.0 * math.sqrt(max(apart, 0.0))
     return chosen, radii, count
+
+
+@compiled
+def _seen_from_keys(transforms: Array) -> Array:
+    """Return (V, 4) the frame's camera in each keyframe's axes, turned to face it; and squared."""
+    out = np.zeros((len(transforms), 4))
+    for v in range(len(transforms)):
+        for c in range(3):
+            for r in range(3):
+                out[v, c] += transforms[v, r, c] * transforms[v, r, 3]
+            out[v, 3] += transforms[v, c, 3] ** 2
+    return out
+
+
+@compiled
+def _most_alike(
+    begin: int, end: int, planes: Array, keyframe: Ints, centres: Array, rules: Array
+) -> tuple[int, float]:
+    """Return which of a landmark's anchors looks most like it from the frame, -1 for none.
+
+    And the square of how far its patch may be misplaced by the change of view
+    (``change_of_view``), px^2. A map has ten and more of them for each landmark: what is
+    worse by the angle alone is not looked at further.
+    """
+    best, least = -1, np.inf
+    by_angle, by_octave = (2.0 * rules[3]) ** 2, rules[4] ** 2
+    nearest, farthest = 4.0 ** rules[5], 4.0 ** -rules[6]
+    for a in range(begin, end):
+        x, y, r, v = planes[a, 0], planes[a, 1], planes[a, 2], keyframe[a]
+        then2 = x * x + y * y + 1.0
+        along = r * (x * centres[v, 0] + y * centres[v, 1] + centres[v, 2])
+        now2 = then2 + 2.0 * along + r * r * centres[v, 3]
+        ratio = then2 / now2
+        sine2 = max(0.5 - 0.5 * (then2 + along) / math.sqrt(then2 * now2), 0.0)
+        if not (by_angle * sine2 < least and sine2 <= 0.49 and farthest <= ratio <= nearest):
+            continue
+        change2 = by_angle * sine2 + by_octave * (0.5 * math.log2(ratio)) ** 2
+        if change2 < least:
+            best, least = a, change2
+    return best, least
+
+
+@compiled
+def _in_turns(order: Ints, rank: Ints, wanted: int) -> Ints:
+    """Return the first so many of an order by rank, and in the order among those of one rank."""
+    n_of_rank = np.zeros(len(rank) + 1, np.int64)
+    for i in order:
+        n_of_rank[rank[i] + 1] += 1
+    place = np.cumsum(n_of_rank)
+    out = np.empty(wanted, np.int64)
+    for i in order:
+        if place[rank[i]] < wanted:
+            out[place[rank[i]]] = i
+        place[rank[i]] += 1
+    return out
 
 
 @compiled

@@ -8,8 +8,9 @@ is laid out once as plain tables for the compiled loops (``patch_views``,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, fields
+from functools import cached_property, lru_cache
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -53,15 +54,17 @@ def pyramid_of(image: Image, n_levels: int = _N_LEVELS) -> Pyramid:
 
     Levels of less than 40 px a side are left out.
     """
-    levels = [np.ascontiguousarray(image)]
-    while len(levels) < n_levels and min(levels[-1].shape) >= 2 * _LEAST_SIDE_PX:
-        levels.append(np.asarray(cv2.pyrDown(levels[-1]), dtype=np.uint8))
-    sizes = [level.size for level in levels]
-    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-    shelves = np.array(
-        [(s, *level.shape) for s, level in zip(starts, levels, strict=True)], dtype=np.int64
-    )
-    return Pyramid(np.concatenate([level.ravel() for level in levels]), shelves)
+    shelves = [(0, *image.shape)]
+    while len(shelves) < n_levels and min(shelves[-1][1:]) >= 2 * _LEAST_SIDE_PX:
+        start, height, width = shelves[-1]
+        shelves.append((start + height * width, (height + 1) // 2, (width + 1) // 2))
+    start, height, width = shelves[-1]
+    texels = np.empty(start + height * width, dtype=np.uint8)
+    levels = [texels[s : s + h * w].reshape(h, w) for s, h, w in shelves]
+    levels[0][:] = image
+    for larger, smaller in pairwise(levels):
+        cv2.pyrDown(larger, smaller)
+    return Pyramid(texels, np.array(shelves, dtype=np.int64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,12 +158,20 @@ class KeyframeImages:
     shelves: Ints
     worlds_from_cams: tuple[Pose, ...]
 
+    @cached_property
+    def centres(self) -> Array:
+        """(V, 3) where the cameras were, world, m."""
+        return np.array([pose.translation for pose in self.worlds_from_cams]).reshape(-1, 3)
+
+    @cached_property
+    def _rotations(self) -> Array:
+        return np.array([pose.rotation for pose in self.worlds_from_cams]).reshape(-1, 3, 3)
+
     def transforms(self, cam_from_world: Pose) -> Array:
         """Return (V, 3, 4) frame_from_key of every keyframe's camera."""
         out = np.empty((len(self.worlds_from_cams), 3, 4))
-        for i, pose in enumerate(self.worlds_from_cams):
-            out[i, :, :3] = cam_from_world.rotation @ pose.rotation
-            out[i, :, 3] = cam_from_world.rotation @ pose.translation + cam_from_world.translation
+        out[:, :, :3] = cam_from_world.rotation @ self._rotations
+        out[:, :, 3] = cam_from_world.apply(self.centres)
         return out
 
 
@@ -289,6 +300,8 @@ class Alignment:
 
     Attributes:
         anchors: (M,) which.
+        points_world: (M, 3) where they are in the map, m, and
+        spread: (M, 6) how exactly it knows (``Anchors.spread``).
         predicted: (M, 2) raw px.
         pixels: (M, 2) where they were found, raw px.
         ideal: (M, 2) the same as ideal image coordinates.
@@ -300,6 +313,8 @@ class Alignment:
     """
 
     anchors: Ints
+    points_world: Array
+    spread: Array
     predicted: Array
     pixels: Array
     ideal: Array
@@ -316,17 +331,8 @@ class Alignment:
 
     def of(self, kept: NDArray[np.bool_]) -> Alignment:
         """Return some of them."""
-        return Alignment(
-            self.anchors[kept],
-            self.predicted[kept],
-            self.pixels[kept],
-            self.ideal[kept],
-            self.slopes[kept],
-            self.noise[kept],
-            self.misplaced[kept],
-            self.scores[kept],
-            self.status[kept],
-        )
+        rows = np.flatnonzero(kept)
+        return Alignment(*(getattr(self, one.name).take(rows, axis=0) for one in fields(self)))
 
 
 def align_patches(
@@ -363,8 +369,8 @@ def align_patches(
     pixels, noise, misplaced, scores, status = kernels.align(
         views,
         seen,
-        anchors.keyframe[chosen],
-        anchors.pixels[chosen],
+        anchors.keyframe.take(chosen),
+        anchors.pixels.take(chosen, axis=0),
         images.texels,
         images.shelves,
         frame.texels,
@@ -387,4 +393,16 @@ def align_patches(
     )
     ideal, slopes = patch_views.unbent(lens.table, pixels, views)
     predicted = np.where(seen[:, None], views[:, 3:5], np.nan)
-    return Alignment(chosen, predicted, pixels, ideal, slopes, noise, misplaced, scores, status)
+    return Alignment(
+        chosen,
+        anchors.points_world.take(chosen, axis=0),
+        anchors.spread.take(chosen, axis=0),
+        predicted,
+        pixels,
+        ideal,
+        slopes,
+        noise,
+        misplaced,
+        scores,
+        status,
+    )
