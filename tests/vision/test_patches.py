@@ -240,3 +240,29 @@ def test_a_pyramid_keeps_places() -> None:
     rows, columns = np.indices(half.shape)
     assert np.isclose((columns * half).sum() / half.sum(), 40.0, atol=0.02)
     assert np.isclose((rows * half).sum() / half.sum(), 32.0, atol=0.02)
+
+
+def test_what_has_no_patch_or_lies_behind_is_not_chosen() -> None:
+    """Of a landmark whose patches all did not fit nothing is left but its place in the table."""
+    rng = np.random.default_rng(9)
+    anchors = anchored(painted(rng), rng.uniform(40.0, [600.0, 440.0], (50, 2)))
+    bare = replace(anchors, first=np.append(anchors.first, [50, 50]))
+    ahead, behind = Pose.identity(), Pose(exp_so3(np.array([0.0, np.pi, 0.0])), np.zeros(3))
+    for pose, n in ((ahead, 50), (behind, 0)):
+        chosen, radii, in_view = choose_anchors(
+            bare, lens_of(PINHOLE), pose, Pose.identity(), 1e-4 * np.eye(6), RULES, 60, 6
+        )
+        assert (len(chosen), len(radii), in_view) == (n, n, n)
+        assert sorted(chosen) == list(range(n))
+
+
+@pytest.mark.parametrize("size", [(480, 640), (427, 641), (161, 83)])
+def test_every_level_is_the_one_before_reduced(size: tuple[int, int]) -> None:
+    image = np.random.default_rng(1).integers(0, 255, size, dtype=np.uint8)
+    pyramid = pyramid_of(image)
+    expected = image
+    for start, height, width in pyramid.shelves:
+        level = pyramid.texels[start : start + height * width].reshape(height, width)
+        assert np.array_equal(level, expected)
+        expected = cv2.pyrDown(expected).astype(np.uint8)
+    assert len(pyramid.texels) == start + height * width
