@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -77,13 +79,16 @@ def gained(
 def _leverage(j_poses: Array, first: Array, second: Array) -> Array:
     """Return (M,) the larger eigenvalue of what each says of itself."""
     m = first.shape[1]
-    uu, uv, vv = np.zeros(m), np.zeros(m), np.zeros(m)
+    out, uu, uv, vv = np.empty(m), np.zeros(m), np.zeros(m), np.zeros(m)
     for c in range(6):
         for i in range(m):
             uu[i] += j_poses[0, c, i] * first[c, i]
             uv[i] += j_poses[0, c, i] * second[c, i]
             vv[i] += j_poses[1, c, i] * second[c, i]
-    return 0.5 * (uu + vv) + np.sqrt(0.25 * (uu - vv) ** 2 + uv * uv)
+    for i in range(m):
+        half, apart = 0.5 * (uu[i] + vv[i]), 0.5 * (uu[i] - vv[i])
+        out[i] = half + math.sqrt(apart * apart + uv[i] * uv[i])
+    return out
 
 
 @reordered

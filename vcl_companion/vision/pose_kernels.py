@@ -134,18 +134,15 @@ def supported(
         _add_up(whitened, sums)
         begin = k * _BLOCK
         n = min(_BLOCK, m - begin)
-        for row in range(2):
-            for c in range(6):
-                at = (_SECOND if row else _FIRST) + c * _BLOCK
-                j_poses[row, c, begin : begin + n] = whitened[at : at + n]
-            for c in range(3):
-                at = _BY_POINT + (3 * row + c) * _BLOCK
-                j_points[row, c, begin : begin + n] = whitened[at : at + n]
-        for c in range(3):
-            at = _ROOT + c * _BLOCK
-            roots[c, begin : begin + n] = whitened[at : at + n]
-        weights[begin : begin + n] = whitened[_WEIGHT : _WEIGHT + n]
         for i in range(n):
+            for c in range(6):
+                j_poses[0, c, begin + i] = whitened[_FIRST + c * _BLOCK + i]
+                j_poses[1, c, begin + i] = whitened[_SECOND + c * _BLOCK + i]
+            for c in range(3):
+                j_points[0, c, begin + i] = whitened[_BY_POINT + c * _BLOCK + i]
+                j_points[1, c, begin + i] = whitened[_BY_POINT + (3 + c) * _BLOCK + i]
+                roots[c, begin + i] = whitened[_ROOT + c * _BLOCK + i]
+            weights[begin + i] = whitened[_WEIGHT + i]
             if not whitened[_SQUARED + i] < largest:
                 continue
             agrees[begin + i] = True
