@@ -15,7 +15,7 @@ from vcl_companion.geometry.rotation import (
     matrix_from_euler,
     matrix_from_quaternion,
 )
-from vcl_companion.localization.intra import LocalizationOptions, Localized
+from vcl_companion.localization.intra import LocalizationOptions, Localized, NotLocalized
 from vcl_companion.localization.pose_filter import FilterOptions, FilterState, NotFused
 
 SURE = np.diag([0.02] * 3 + [0.002] * 3) ** 2
@@ -75,3 +75,24 @@ def test_a_peer_s_word_is_not_judged_by_a_heading_that_is_none() -> None:
         )
         assert isinstance(refused, NotFused)
         assert "roll and pitch" in refused.reason
+
+
+def test_fixes_that_all_come_late_are_believed_at_last_when_they_contradict() -> None:
+    """Where every frame has to be searched for, newer ones are looked at meanwhile."""
+    mine = estimator(has_heading=False)
+    said = about_down(NORTH_RAD) @ BODY
+    assert isinstance(mine.take_fix(None, fix(), 0, said), FilterState)
+    # A turn of the autopilot's north that was taken for the drone's.
+    wrong = about_down(NORTH_RAD + 0.15) @ BODY
+    taken = []
+    for k in range(1, 6):
+        at_ns = k * 100_000_000
+        for ns in (at_ns, at_ns + 33_000_000):
+            mine.take_nothing(mine.predicted(ns, wrong), ns, wrong)
+        taken.append(mine.take_fix(None, fix(), at_ns, wrong))
+    assert all(isinstance(one, NotLocalized) and "turned" in one.reason for one in taken[:4])
+    assert isinstance(taken[4], FilterState)
+    assert mine.n_resets == 1
+    goes_on = mine.predicted(600_000_000, wrong)
+    assert goes_on is not None
+    np.testing.assert_allclose(goes_on.world_from_body.rotation, BODY, atol=1e-6)

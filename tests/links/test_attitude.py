@@ -169,6 +169,16 @@ def test_one_that_has_found_its_north_tells_in_that_from_then_on() -> None:
         assert angle(attitude.ned_from_body, found @ true_at(at_ns)) < np.deg2rad(0.1)
 
 
+@pytest.mark.parametrize("short_ms", [1, 2, 4])
+def test_two_samples_shortly_after_each_other_hide_no_turn_of_the_north(short_ms: int) -> None:
+    """Seen at 90 samples a second: what was missed came back as a turn the other way."""
+    times = list(range(1000 * MS, 2000 * MS, 11 * MS))
+    times += [times[-1] + short_ms * MS]
+    turned_from = times[-1] + 11 * MS
+    ours = flown([*times, *range(turned_from, turned_from + 200 * MS, 7 * MS)], turned_from)
+    assert np.isclose(ours.north_rad, NORTH_RAD, rtol=0.02)
+
+
 def test_noise_and_lost_samples_are_no_turn_of_the_north() -> None:
     rng = np.random.default_rng(3)
     times = [t for t in range(1000 * MS, 5000 * MS, 20 * MS) if rng.random() > 0.3]

@@ -269,10 +269,20 @@ class Estimator:
     def _take_late(self, fix: Localized, at_ns: int) -> FilterState | NotLocalized:
         before = self._history.at(at_ns)
         state = self._history.refit(at_ns, fix)
-        if isinstance(state, FilterState):
-            if before is not None and state.n_jumps > before.n_jumps:
-                self._jump(f"relocalized with {fix.n_inliers} landmarks")
-            self._n_contradicted = 0
+        if before is None or state is None:
+            return NotLocalized("found after a later frame had been")
+        if isinstance(state, NotLocalized):
+            # Where every frame has to be searched for, all are found late: as in ``take_fix``.
+            self._n_contradicted += 1
+            if self._n_contradicted < _MAX_CONTRADICTED:
+                return state
+            self._jump(f"relocalized with {fix.n_inliers} landmarks")
+            self._history.clear()
+            state = started(fix, at_ns, before.ned_from_body, self._options)
+            self._history.append(state, fix, before.ned_from_body)
+        elif state.n_jumps > before.n_jumps:
+            self._jump(f"relocalized with {fix.n_inliers} landmarks")
+        self._n_contradicted = 0
         return state
 
     def take_proposal(

@@ -38,6 +38,8 @@ _CARRIED_STEPS = 1.25
 # the noise of two samples, and more than a drone can accelerate its turn.
 _HEADING_NOISE_RAD = math.radians(1.5)
 _HEADING_ACCELERATION_RAD_S2 = 20.0
+# A rate is by samples at least so far from each other, as a share of how long it is carried on.
+_LEAST_SHARE, _MOST_STEPS_BACK = 0.7, 16
 
 Taken = Literal["taken", "overtaken", "rebooted", "turned"]
 
@@ -206,9 +208,15 @@ class AttitudeHistory:
         """Return by how much the autopilot turned its north before a sample, rad; 0 if not."""
         if len(self._samples) < 2:
             return 0.0
-        before, last = self._samples[-2], self._samples[-1]
-        step_s = (self._measured_ns(last) - self._measured_ns(before)) * 1e-9
-        since_s = (self._measured_ns(sample) - self._measured_ns(last)) * 1e-9
+        last = self._samples[-1]
+        since_s = self._s_between(last, sample)
+        # By samples close to each other it would be mostly noise, and they do come at odd times.
+        before = self._samples[-2]
+        for i in range(2, min(len(self._samples), _MOST_STEPS_BACK) + 1):
+            before = self._samples[-i]
+            if self._s_between(before, last) >= _LEAST_SHARE * since_s:
+                break
+        step_s = self._s_between(before, last)
         if step_s <= 0.0:
             return 0.0
         expected_rad = _heading_change(before, last) * since_s / step_s
@@ -216,6 +224,9 @@ class AttitudeHistory:
         possible_rad = _HEADING_NOISE_RAD * max(1.0, since_s / step_s)
         possible_rad += _HEADING_ACCELERATION_RAD_S2 * since_s * max(step_s, since_s)
         return beyond_rad if abs(beyond_rad) > possible_rad else 0.0
+
+    def _s_between(self, before: AttitudeSample, after: AttitudeSample) -> float:
+        return (self._measured_ns(after) - self._measured_ns(before)) * 1e-9
 
     def _newest_ns(self, offset_ns: int) -> int:
         return self._measured_ns(self._samples[-1]) + offset_ns

@@ -122,7 +122,7 @@ class PoseHistory:
             return NotFused("the state is too old to go on from")
         return self._steps[-1].state
 
-    def refit(self, at_ns: int, fix: Localized) -> FilterState | NotLocalized:
+    def refit(self, at_ns: int, fix: Localized) -> FilterState | NotLocalized | None:
         """Take in what a frame gave after later ones had been, and bring these up to date.
 
         Args:
@@ -130,16 +130,17 @@ class PoseHistory:
             fix: what it gave.
 
         Returns:
-            The state of that instant with the fix in it, or why it was not taken.
+            The state of that instant with the fix in it, or how the fix contradicts it; None
+            where it comes too late, or the frame has one.
         """
         k = self._nearest(at_ns)
         if k is None or self._steps[k].fix is not None:
-            return NotLocalized("found after a later frame had been")
+            return None
         updated = update(self._steps[k].state, fix)
         if isinstance(updated, NotLocalized):
             return updated
         if not self._replay(k, _Step(updated, fix, self._steps[k].ned_from_body)):
-            return NotLocalized("the state is too old to go on from")
+            return None
         return updated
 
     def _replay(self, k: int, changed: _Step) -> bool:
