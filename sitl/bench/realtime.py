@@ -81,7 +81,7 @@ def figures_of(drone: Mapping[str, Any]) -> tuple[Figure, ...]:
     latency = drone["latency_ms"]
     return (
         Figure("frames", drone["frames"], ""),
-        Figure("localized", 100.0 * drone["localized_share"], "%"),
+        Figure("localized", 100.0 * drone["localized_share"], "%", 99.0, at_least=True),
         Figure("dropped", 100.0 * drone["frames_dropped"] / drone["frames"], "%", 1.0),
         Figure("capture to wire, p50", number(latency["p50"]), "ms"),
         Figure("capture to wire, p95", number(latency["p95"]), "ms"),
