@@ -244,19 +244,13 @@ class Estimator:
             updated = update(predicted, fix)
             if isinstance(updated, FilterState):
                 if updated.n_jumps > predicted.n_jumps:
-                    self._jump(f"relocalized with {fix.n_inliers} landmarks")
+                    self._relocalized(fix)
                 state = updated
-            else:
-                # One fix against the state is wrong; several in a row say that the state
-                # is, or that the autopilot has turned its north.
-                self._n_contradicted += 1
-                if self._n_contradicted < _MAX_CONTRADICTED:
-                    self.take_nothing(predicted, at_ns, ned_from_body)
-                    return updated
-                self._jump(f"relocalized with {fix.n_inliers} landmarks")
-                self._history.clear()
+            elif not self._begins_anew(fix):
+                self.take_nothing(predicted, at_ns, ned_from_body)
+                return updated
         elif self._has_begun:
-            self._jump(f"relocalized with {fix.n_inliers} landmarks")
+            self._relocalized(fix)
         self._n_contradicted = 0
         self._has_begun = True
         self.tracked, self.covered = fix.n_seen, fix.covered
@@ -272,16 +266,13 @@ class Estimator:
         if before is None or state is None:
             return NotLocalized("found after a later frame had been")
         if isinstance(state, NotLocalized):
-            # Where every frame has to be searched for, all are found late: as in ``take_fix``.
-            self._n_contradicted += 1
-            if self._n_contradicted < _MAX_CONTRADICTED:
+            # Where every frame has to be searched for, all are found late.
+            if not self._begins_anew(fix):
                 return state
-            self._jump(f"relocalized with {fix.n_inliers} landmarks")
-            self._history.clear()
             state = started(fix, at_ns, before.ned_from_body, self._options)
             self._history.append(state, fix, before.ned_from_body)
         elif state.n_jumps > before.n_jumps:
-            self._jump(f"relocalized with {fix.n_inliers} landmarks")
+            self._relocalized(fix)
         self._n_contradicted = 0
         return state
 
@@ -386,6 +377,22 @@ class Estimator:
     def _note(self, at_ns: int) -> None:
         self._looked_at_ns = at_ns
         self._looked.set()
+
+    def _begins_anew(self, fix: Localized) -> bool:
+        """Count a fix against the state; leave the state, and return True, if it is believed now.
+
+        One is wrong; several in a row say that the state is, or that the autopilot has turned
+        its north.
+        """
+        self._n_contradicted += 1
+        if self._n_contradicted < _MAX_CONTRADICTED:
+            return False
+        self._relocalized(fix)
+        self._history.clear()
+        return True
+
+    def _relocalized(self, fix: Localized) -> None:
+        self._jump(f"relocalized with {fix.n_inliers} landmarks")
 
     def _jump(self, why: str) -> None:
         self.n_resets += 1

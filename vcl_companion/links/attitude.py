@@ -210,12 +210,7 @@ class AttitudeHistory:
             return 0.0
         last = self._samples[-1]
         since_s = self._s_between(last, sample)
-        # By samples close to each other it would be mostly noise, and they do come at odd times.
-        before = self._samples[-2]
-        for i in range(2, min(len(self._samples), _MOST_STEPS_BACK) + 1):
-            before = self._samples[-i]
-            if self._s_between(before, last) >= _LEAST_SHARE * since_s:
-                break
+        before = self._far_enough_back(since_s)
         step_s = self._s_between(before, last)
         if step_s <= 0.0:
             return 0.0
@@ -224,6 +219,16 @@ class AttitudeHistory:
         possible_rad = _HEADING_NOISE_RAD * max(1.0, since_s / step_s)
         possible_rad += _HEADING_ACCELERATION_RAD_S2 * since_s * max(step_s, since_s)
         return beyond_rad if abs(beyond_rad) > possible_rad else 0.0
+
+    def _far_enough_back(self, since_s: float) -> AttitudeSample:
+        """Return the sample to take the rate by that is carried on for so long; of two or more.
+
+        By one close to the newest it would be mostly noise, and they do come at odd times.
+        """
+        back = range(2, min(len(self._samples), _MOST_STEPS_BACK) + 1)
+        last, earlier = self._samples[-1], [self._samples[-i] for i in back]
+        far = (s for s in earlier if self._s_between(s, last) >= _LEAST_SHARE * since_s)
+        return next(far, earlier[-1])
 
     def _s_between(self, before: AttitudeSample, after: AttitudeSample) -> float:
         return (self._measured_ns(after) - self._measured_ns(before)) * 1e-9
