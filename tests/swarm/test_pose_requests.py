@@ -12,6 +12,7 @@ from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
 from vcl_companion.wire.messages import MapState
 
 MAP, OTHER = b"this map", b"that map"
+SECOND = 10**9
 
 
 def group_of(*hosts: int) -> Group:
@@ -37,11 +38,11 @@ def test_only_peers_that_are_localized_on_our_map_are_asked() -> None:
 def test_everybody_is_tried_then_the_surest_and_the_others_in_turn() -> None:
     choice = HostChoice(group_of(1, 2, 3, 4))
     assert choice.choose(MAP, 2) == [1, 2]
-    choice.answered(1, 0.5, 0)
-    choice.answered(2, math.inf, 0)
+    choice.answered(1, 0.5, 1.0, 0)
+    choice.answered(2, math.inf, 1.0, 0)
     assert choice.choose(MAP, 2) == [3, 4]
-    choice.answered(3, 0.1, 0)
-    choice.answered(4, math.inf, 0)
+    choice.answered(3, 0.1, 1.0, 0)
+    choice.answered(4, math.inf, 1.0, 0)
     assert choice.choose(MAP, 3) == [3, 1, 2]
     assert choice.choose(MAP, 3) == [3, 1, 4]  # who could not tell may be able to by now
     choice.lost(2)
@@ -49,18 +50,42 @@ def test_everybody_is_tried_then_the_surest_and_the_others_in_turn() -> None:
 
 
 def test_only_who_was_surer_of_us_lately_may_know_better() -> None:
-    choice, second = HostChoice(group_of(1, 2)), 10**9
-    assert not choice.may_know_better(MAP, 0.2, 0)  # never asked
-    choice.answered(1, 0.1, 0)
-    choice.answered(2, math.inf, 5 * second)
-    assert choice.may_know_better(MAP, 0.2, 29 * second)
-    assert not choice.may_know_better(OTHER, 0.2, 29 * second)  # nobody flies on it
-    assert not choice.may_know_better(MAP, 0.02, 29 * second)
-    assert not choice.may_know_better(MAP, 0.2, 31 * second)
-    choice.answered(2, 0.01, 36 * second)
-    assert choice.may_know_better(MAP, 0.02, 37 * second)
+    choice = HostChoice(group_of(1, 2))
+
+    def may(revision: bytes, at_s: int) -> bool:
+        return choice.may_know_better(revision, at_s * SECOND, is_weak=False)
+
+    assert not may(MAP, 0)  # never asked
+    choice.answered(1, 0.1, 0.2, 0)
+    choice.answered(2, math.inf, 0.2, 5 * SECOND)
+    assert may(MAP, 29)
+    assert not may(OTHER, 29)  # nobody flies on it
+    assert not may(MAP, 31)
+    choice.answered(2, 0.19, 0.2, 35 * SECOND)  # as sure as we are: it flies on the same map
+    assert not may(MAP, 36)
+    choice.answered(2, 10.0, math.inf, 36 * SECOND)  # we knew nothing
+    assert may(MAP, 37)
     choice.lost(2)
-    assert not choice.may_know_better(MAP, 0.02, 37 * second)
+    assert not may(MAP, 37)
+
+
+def test_who_knows_little_asks_those_who_have_not_shown_lately_that_they_know_no_better() -> None:
+    choice = HostChoice(group_of(1, 2))
+
+    def may(at_s: int) -> bool:
+        return choice.may_know_better(MAP, at_s * SECOND, is_weak=True)
+
+    assert may(0)  # never asked
+    choice.answered(1, 0.5, 0.5, 0)
+    assert may(1)  # the other one
+    choice.answered(2, math.inf, 0.5, SECOND)
+    assert not may(2)
+    assert not may(10)
+    assert may(11)  # by now the first may
+    choice.answered(1, math.inf, math.inf, 11 * SECOND)  # it could not tell, nor could we
+    choice.answered(2, 0.3, 0.5, 11 * SECOND)
+    assert may(12)
+    assert may(41)
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,7 @@ class Asked:
         frame: the one that the pose is wanted of.
         ned_from_body: (3, 3) attitude of its instant, or None.
         revision: of the map that the pose is wanted in.
+        sigma_m: what is known of it without; infinite for nothing.
         waiting: hosts that have not answered yet.
         proposals: host and what it said, not yet handed over.
     """
@@ -50,6 +51,7 @@ class Asked:
     frame: Frame
     ned_from_body: Array | None
     revision: bytes
+    sigma_m: float
     waiting: set[int]
     proposals: list[tuple[int, PoseProposal]] = field(default_factory=list)
     changed: asyncio.Event = field(default_factory=asyncio.Event)
@@ -152,8 +154,8 @@ class InterTarget:
             return None
         if (
             self._only_the_surer
-            and not is_weak
-            and not self._hosts.may_know_better(revision, sigma_m, at_ns)
+            and math.isfinite(sigma_m)
+            and not self._hosts.may_know_better(revision, at_ns, is_weak=is_weak)
         ):
             return None
         hosts = self._hosts.choose(revision, self._n_hosts())
@@ -163,7 +165,7 @@ class InterTarget:
         self._last_at_ns = at_ns
         self._is_open = True
         self._request_id = (self._request_id + 1) % (1 << 32)
-        asked = Asked(self._request_id, frame, ned_from_body, revision, set(hosts))
+        asked = Asked(self._request_id, frame, ned_from_body, revision, sigma_m, set(hosts))
         self._asked[asked.request_id] = asked
         return asked
 
@@ -227,14 +229,15 @@ class InterTarget:
             return "pose that comes too late to be fused"
         if asked is None or peer not in asked.waiting:
             return "pose nobody asked for"
+        sigma_m = math.inf
         if isinstance(answer, PoseProposal):
             if answer.revision != asked.revision:
                 return "pose nobody asked for"
             asked.proposals.append((peer, answer))
-            self._hosts.answered(peer, _sigma_m(answer), asked.frame.captured_at_ns)
+            sigma_m = _sigma_m(answer)
         else:
-            self._hosts.answered(peer, math.inf, asked.frame.captured_at_ns)
             _log.debug("drone %d proposes no pose: %s", peer, answer.reason)
+        self._hosts.answered(peer, sigma_m, asked.sigma_m, asked.frame.captured_at_ns)
         self._answered(asked, peer)
         return None
 

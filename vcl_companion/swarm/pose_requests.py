@@ -21,7 +21,8 @@ class InterMavOptions(InterOptions):
         least_interval_s: localized frames ask no more often, however many there are, nor
             do refused ones when nobody could answer the last time: looking costs each
             host a fifth of a second of one core.
-        weak_sigma_m: a localized frame whose pose is less certain than this asks too.
+        weak_sigma_m: a localized frame whose pose is less certain than this asks too, of those
+            who have not shown lately that they know it no better.
         wait_s: a refused frame waits this long for an answer, beyond what the link takes to
             carry the request.
         max_hosts: peers asked at once; fewer where the link takes too long for so many.
@@ -60,6 +61,20 @@ class InterMavOptions(InterOptions):
 
 # What peers knew so long ago tells no more whether they know better than we do.
 _REMEMBERED_S = 30.0
+# Who knows little of where it is tries again after so long whether they still do not.
+_DOUBTED_S = 10.0
+# What is hardly surer is not worth its bytes, nor the host's half second: all fly on one map,
+# and what that is off by, everybody is.
+_SURER = 0.8
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """How sure a peer's last answer was: its position's 1 sigma, m, and as a share of our own."""
+
+    sigma_m: float
+    share: float
+    at_ns: int
 
 
 class HostChoice:
@@ -71,8 +86,7 @@ class HostChoice:
 
     def __init__(self, group: Group) -> None:
         self._group = group
-        self._sigma_m: dict[int, float] = {}
-        self._told_at_ns: dict[int, int] = {}
+        self._told: dict[int, _Answer] = {}
         self._asked_in: dict[int, int] = {}
         self._n_requests = 0
 
@@ -83,31 +97,52 @@ class HostChoice:
         then those who could not tell, the one that was not asked for longest first.
         """
         able = self._able(revision)
-        able.sort(key=lambda p: (self._sigma_m.get(p, 0.0), self._asked_in.get(p, 0), p))
+        able.sort(key=lambda p: (self._sigma_m(p), self._asked_in.get(p, 0), p))
         chosen = able[:at_most]
         self._n_requests += 1
         for peer in chosen:
             self._asked_in[peer] = self._n_requests
         return chosen
 
-    def may_know_better(self, revision: bytes, sigma_m: float, at_ns: int) -> bool:
-        """Whether a peer was surer of us lately than we are now.
+    def may_know_better(self, revision: bytes, at_ns: int, *, is_weak: bool) -> bool:
+        """Whether a peer may be surer of us than we are.
 
         Args:
             revision: of our map.
-            sigma_m: of our position, in its worst direction.
             at_ns: now, in the time of ``answered``.
+            is_weak: whether we know little: then whoever has not been asked lately may. Else
+                only those who were surer lately than we were then.
         """
-        return any(
-            self._sigma_m.get(peer, math.inf) < sigma_m
-            and at_ns - self._told_at_ns[peer] <= _REMEMBERED_S * 1e9
-            for peer in self._able(revision)
-        )
+        return any(self._may(peer, at_ns, is_weak) for peer in self._able(revision))
 
-    def answered(self, peer: int, sigma_m: float, at_ns: int) -> None:
-        """Note how sure an answer was; infinite for a peer that could not tell."""
-        self._sigma_m[peer] = sigma_m
-        self._told_at_ns[peer] = at_ns
+    def answered(self, peer: int, sigma_m: float, own_sigma_m: float, at_ns: int) -> None:
+        """Note how sure an answer was, 1 sigma in the worst direction.
+
+        Args:
+            peer: whose.
+            sigma_m: infinite for one that could not tell.
+            own_sigma_m: what we knew ourselves; infinite for nothing.
+            at_ns: when.
+        """
+        share = math.inf if math.isinf(sigma_m) else sigma_m / own_sigma_m
+        self._told[peer] = _Answer(sigma_m, share, at_ns)
+
+    def lost(self, peer: int) -> None:
+        """Forget a peer: when it comes back it is a new one."""
+        self._told.pop(peer, None)
+        self._asked_in.pop(peer, None)
+
+    def _may(self, peer: int, at_ns: int, is_weak: bool) -> bool:
+        told = self._told.get(peer)
+        if told is None:
+            return is_weak
+        since_s = 1e-9 * (at_ns - told.at_ns)
+        was_surer = told.share < _SURER and since_s <= _REMEMBERED_S
+        return was_surer or (is_weak and since_s > _DOUBTED_S)
+
+    def _sigma_m(self, peer: int) -> float:
+        told = self._told.get(peer)
+        return 0.0 if told is None else told.sigma_m
 
     def _able(self, revision: bytes) -> list[int]:
         """Return the peers that are localized in a map, and believed."""
@@ -120,9 +155,3 @@ class HostChoice:
             and (state := group.state_of(peer))
             and state.localized
         ]
-
-    def lost(self, peer: int) -> None:
-        """Forget a peer: when it comes back it is a new one."""
-        self._sigma_m.pop(peer, None)
-        self._told_at_ns.pop(peer, None)
-        self._asked_in.pop(peer, None)
