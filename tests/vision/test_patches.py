@@ -58,7 +58,7 @@ def anchored(
         own=np.zeros((n, 3)),
         spread=np.tile([1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4], (n, 1)),
         texture=np.tile([4e4, 0.0, 4e4], (n, 1)),
-        images=keyframe_images([image], [Pose.identity()]),
+        images=keyframe_images([pyramid_of(image)], [Pose.identity()]),
     )
 
 

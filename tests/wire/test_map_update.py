@@ -35,6 +35,7 @@ from vcl_companion.wire.map_update import (
     images_missing_in,
     name_of_image,
     names_of_update,
+    with_images,
     without_images,
 )
 
@@ -109,6 +110,8 @@ def test_what_comes_out_is_what_went_in(
     carried = {name_of_image(k.image_bytes): k.image_bytes for k in decode_map(data).keyframes}
     bare = without_images(blob, carried)
     assert decode_map_update(bare, parent, carried) == data
+    assert with_images(bare, carried) == blob
+    assert with_images(blob, {}) == blob
 
 
 def test_what_has_not_changed_costs_next_to_nothing() -> None:
@@ -169,6 +172,14 @@ def test_an_image_that_is_not_here_is_told_of() -> None:
         decode_map_update(blob, PARENT, {name_of_image(b"another"): b"another"})
     with pytest.raises(WireError, match="another map"):
         decode_map_update(blob, PARENT, {NEW: b"another"})
+    with pytest.raises(WireError, match="sent ahead is not here"):
+        with_images(blob, {})
+
+
+def test_images_that_make_an_update_too_long_are_a_wire_error() -> None:
+    blob = without_images(encode_map_update(CHILD, PARENT), {NEW})
+    with pytest.raises(WireError, match="image"):
+        with_images(blob, {NEW: bytes(9 * 1024 * 1024)})
 
 
 def test_another_parent_is_refused() -> None:

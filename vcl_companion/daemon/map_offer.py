@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from vcl_companion.daemon.feature_memory import FeatureMemory
@@ -17,7 +17,12 @@ from vcl_companion.vision.features import Detector, FeatureOptions, Features
 from vcl_companion.wire.header import BlobKind
 from vcl_companion.wire.map_codec import decode_map, parent_of, revision_of
 from vcl_companion.wire.map_part import decode_map_part
-from vcl_companion.wire.map_update import decode_map_update, encode_map_update, names_of_update
+from vcl_companion.wire.map_update import (
+    decode_map_update,
+    encode_map_update,
+    names_of_update,
+    with_images,
+)
 
 
 @dataclass(frozen=True)
@@ -101,6 +106,7 @@ def ready_map(
     memory: FeatureMemory,
     tracked: bool,
     held: Mapping[bytes, bytes],
+    decode: Callable[[bytes], LandmarkMap] = decode_map,
 ) -> ReadyMap:
     """Decode, index and cut patches; takes a second, beside the event loop and the frames.
 
@@ -111,9 +117,10 @@ def ready_map(
         current: the map in use, perhaps its parent.
         detector: the localization's own.
         features: how they are found.
-        memory: finds them.
+        memory: finds them, and decodes images.
         tracked: whether the map is also made ready to be tracked.
         held: images that were sent ahead, by their names.
+        decode: ``decode_map``, or what remembers what that has returned.
 
     Raises:
         WireError: the bytes are no map, or need a parent that is not in use here, or
@@ -131,14 +138,19 @@ def ready_map(
         raise ValueError("an update of a map that is not in use here")
     else:
         data = decode_map_update(offer.blob, parent, held)
+    whole = decode(data)
 
-    index = shared(_indexed(decode_map(data), detector, features, memory))
     update = offer.update
     if current is not None and current.revision == offer.parent and not update:
-        update = encode_map_update(data, current.index.landmark_map)
+        if offer.kind == BlobKind.MAP_UPDATE:
+            update = with_images(offer.blob, held)
+        else:
+            update = encode_map_update(data, current.index.landmark_map, whole)
+
+    index = shared(_indexed(whole, detector, features, memory))
     templates = None
     if tracked:
-        templates = shared(prepare_templates(index.landmark_map, index.uncertainty))
+        templates = shared(prepare_templates(index.landmark_map, index.uncertainty, memory.pyramid))
     contradicts = (
         "" if current is None else _contradiction(current, index.landmark_map, offer.revision)
     )

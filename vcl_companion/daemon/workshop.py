@@ -87,6 +87,7 @@ class Workshop:
         self._other_memory = FeatureMemory(features, n_images)  # another thread's
         self._look = PeerLook(sensor, features, options.inter, options.detectors, options.tracked)
         self._maps: dict[bytes, StoredMap] = {}
+        self._encoded: tuple[bytes, LandmarkMap] | None = None
 
     def learn(self, stored: StoredMap) -> None:
         """Take a map that was made elsewhere, or before this workshop was."""
@@ -167,9 +168,10 @@ class Workshop:
         Raises:
             ValueError: the map breaks a bound that peers hold every map to.
         """
-        data = encode_map(built)
         before = self._named(parent).index.landmark_map if parent else None
-        update = encode_map_update(data, before)
+        data = encode_map(built)
+        self._encoded = data, decode_map(data)  # it will be flown on next
+        update = encode_map_update(data, before, self._encoded[1])
         return HandOut(revision_of(data), built.parent, data, update)
 
     def part(self, revision: bytes, most_bytes: int) -> bytes:
@@ -215,11 +217,16 @@ class Workshop:
         self.keep_only(current)
         ready = ready_map(
             offer, stored, options.detectors[0], options.pipeline.features, self._memory,
-            options.tracked, held,
+            options.tracked, held, self._decoded,
         )  # fmt: skip
         self.learn(ready.stored())
         give_back_freed()  # making it took a hundred megabytes more than it is
         return ready
+
+    def _decoded(self, data: bytes) -> LandmarkMap:
+        """Return the map of encoded bytes; that of the one encoded last is there, once."""
+        encoded, self._encoded = self._encoded, None
+        return encoded[1] if encoded is not None and encoded[0] == data else decode_map(data)
 
     def more_indexed(self, revision: bytes) -> MapIndex:
         """Return a map's index with those by the other detectors to fall back on."""

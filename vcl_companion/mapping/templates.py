@@ -9,19 +9,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.drone_view import decode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.patch_table import PyramidOf, decoded_pyramid
 from vcl_companion.mapping.surfaces import slopes_of
 from vcl_companion.mapping.uncertainty import MapUncertainty
-from vcl_companion.vision.features import Image
 from vcl_companion.vision.patches import Anchors, keyframe_images
+from vcl_companion.vision.texture import textures
 
 _HALF_PX = 4
 # A point that projects farther than this from where it was seen is a wrong one.
@@ -41,12 +40,17 @@ class Templates:
     uncertainty: MapUncertainty
 
 
-def prepare_templates(landmark_map: LandmarkMap, uncertainty: MapUncertainty) -> Templates:
+def prepare_templates(
+    landmark_map: LandmarkMap,
+    uncertainty: MapUncertainty,
+    pyramid_of: PyramidOf = decoded_pyramid,
+) -> Templates:
     """Make a map ready for patch tracking.
 
     Args:
         landmark_map: any revision.
         uncertainty: its own (``map_uncertainty``).
+        pyramid_of: decodes an image.
 
     Returns:
         The anchors; none where nothing of the map can be found again in its keyframes.
@@ -54,7 +58,7 @@ def prepare_templates(landmark_map: LandmarkMap, uncertainty: MapUncertainty) ->
     Raises:
         ValueError: an image cannot be decoded.
     """
-    images = [decode_image(k.image_bytes, k.camera) for k in landmark_map.keyframes]
+    pyramids = [pyramid_of(k.image_bytes, k.camera) for k in landmark_map.keyframes]
     poses = [k.world_from_body @ k.body_from_cam for k in landmark_map.keyframes]
     views = [_anchored(landmark_map, i, pose) for i, pose in enumerate(poses)]
     is_anchor = np.zeros(landmark_map.seen.shape, dtype=bool)
@@ -72,7 +76,7 @@ def prepare_templates(landmark_map: LandmarkMap, uncertainty: MapUncertainty) ->
             continue
         camera = landmark_map.keyframes[i].camera
         pixels[rows] = view.pixels
-        texture[rows] = _texture(images[i], view.pixels)
+        texture[rows] = textures(pyramids[i].image, view.pixels, _HALF_PX)
         planes[rows], own[rows] = _planes(view, camera, poses[i], uncertainty)
         spread[rows] = (own[rows, :, None] * own[rows, None, :])[:, *np.triu_indices(3)]
     n_anchors = np.concatenate([[0], is_anchor.sum(axis=1)])
@@ -86,7 +90,7 @@ def prepare_templates(landmark_map: LandmarkMap, uncertainty: MapUncertainty) ->
         own=own,
         spread=spread,
         texture=texture,
-        images=keyframe_images(images, poses),
+        images=keyframe_images(pyramids, poses),
     )
     return Templates(anchors, uncertainty)
 
@@ -134,17 +138,3 @@ def _planes(
     planes = np.column_stack([ideal, inverse_depth, slopes, lens])
     per_metre = np.column_stack([ideal, np.ones(len(z))]) @ world_from_cam.rotation.T
     return planes, per_metre * (sigma / inverse_depth**2)[:, None]
-
-
-def _texture(image: Image, pixels: Array) -> Array:
-    """Return (M, 3) xx xy yy of the squared gradient summed over the patch at each pixel."""
-    gx = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=1) * 0.5
-    gy = cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=1) * 0.5
-    side = 2 * _HALF_PX + 1
-    at = np.round(pixels).astype(np.intp)
-    return np.column_stack(
-        [
-            cv2.boxFilter(product, cv2.CV_32F, (side, side), normalize=False)[at[:, 1], at[:, 0]]
-            for product in (gx * gx, gx * gy, gy * gy)
-        ]
-    ).astype(np.float64)

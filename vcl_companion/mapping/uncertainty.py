@@ -21,7 +21,7 @@ from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.vision.bundle import Distance, Views, normal_equations
 from vcl_companion.vision.information import covariance_of
-from vcl_companion.vision.schur import eliminated
+from vcl_companion.vision.schur import carried, eliminated
 
 # Smallest eigenvalue of an information matrix with ones on its diagonal; eliminating
 # landmarks of little parallax leaves 1e-12 by rounding.
@@ -56,9 +56,9 @@ class MapUncertainty:
 
     def marginal(self) -> Array:
         """Return (N, 3, 3) the whole covariance of each landmark, m^2."""
-        return self._with_shared(np.arange(len(self.landmark_lever)), 1.0)
+        return self._with_shared(np.arange(len(self.landmark_lever), dtype=np.int64), 1.0)
 
-    def for_matching(self, landmarks: NDArray[np.intp]) -> Array:
+    def for_matching(self, landmarks: NDArray[np.int64]) -> Array:
         """Return (M, 3, 3) covariances that tell sightings of some landmarks from wrong ones.
 
         The error that they share is taken for more than it is: where a wide step ends a map, all
@@ -66,12 +66,10 @@ class MapUncertainty:
         """
         return self._with_shared(landmarks, _WIDER)
 
-    def _with_shared(self, landmarks: NDArray[np.intp], factor: float) -> Array:
-        out = self.landmark_covariance[landmarks]
-        for some in _portions(len(landmarks)):
-            lever = self.landmark_lever[landmarks[some]]
-            shared = factor**2 * lever @ self.keyframe_covariance
-            out[some] += shared @ np.swapaxes(lever, 1, 2)
+    def _with_shared(self, landmarks: NDArray[np.int64], factor: float) -> Array:
+        out = carried(self.landmark_lever, self.keyframe_covariance, landmarks)
+        out *= factor**2
+        out += self.landmark_covariance[landmarks]
         return out
 
 

@@ -175,9 +175,8 @@ class KeyframeImages:
         return out
 
 
-def keyframe_images(images: list[Image], worlds_from_cams: list[Pose]) -> KeyframeImages:
-    """Lay out the images of V keyframes; their pyramids get as many levels as the smallest has."""
-    pyramids = [pyramid_of(image) for image in images]
+def keyframe_images(pyramids: list[Pyramid], worlds_from_cams: list[Pose]) -> KeyframeImages:
+    """Lay out the images of V keyframes; all get as many levels as the smallest has."""
     n_levels = min(len(p.shelves) for p in pyramids)
     starts = np.concatenate([[0], np.cumsum([len(p.texels) for p in pyramids])[:-1]])
     shelves = np.stack(

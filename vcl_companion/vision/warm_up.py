@@ -28,8 +28,9 @@ from vcl_companion.vision.patches import (
     pyramid_of,
 )
 from vcl_companion.vision.relative_pose import essential_candidates
-from vcl_companion.vision.schur import eliminated
+from vcl_companion.vision.schur import carried, eliminated
 from vcl_companion.vision.surface_kernels import inclinations
+from vcl_companion.vision.texture import textures
 from vcl_companion.vision.triangulation import ray_angles
 
 
@@ -42,6 +43,7 @@ def warm_up() -> None:
     essential_candidates(ideal_a, ideal_b, 320.0, rng)
     resect(ideal_b, points, 320.0, rng)
     eliminated(np.zeros((1, 6, 3)), np.zeros((1, 3, 3)), np.ones((1, 1), dtype=np.bool_))
+    carried(np.ones((1, 3, 6), np.float32), np.eye(6), np.zeros(1, np.int64))
     descriptors = np.asarray(rng.integers(0, 255, (40, 61)), dtype=np.uint8)
     nearest_two(descriptors, hamming_index(descriptors, np.arange(40)))
     still = Features(320.0 * ideal_a, descriptors)
@@ -90,9 +92,10 @@ def _track(rng: np.random.Generator) -> None:
         own=np.zeros((n, 3)),
         spread=np.tile([1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6], (n, 1)),
         texture=np.tile([1e5, 0.0, 1e5], (n, 1)),
-        images=keyframe_images([image], [still]),
+        images=keyframe_images([pyramid_of(image)], [still]),
     )
     lens, frame = lens_of(camera), pyramid_of(image)
+    textures(image, pixels, 4)
     rules = ChoiceRules(40.0, 4.0, 0.05, 0.5, 0.03, 1.5, 3.5)
     rows, *_ = choose_anchors(anchors, lens, still, still, np.eye(6), rules, n, 6.0)
     found = align_patches(anchors, rows, frame, lens, still, np.ones(n), 0, AlignRules())

@@ -46,18 +46,21 @@ def name_of_image(image_bytes: bytes) -> bytes:
     return hashlib.sha256(image_bytes).digest()[:_NAME_BYTES]
 
 
-def encode_map_update(data: bytes, parent: LandmarkMap | None) -> bytes:
+def encode_map_update(
+    data: bytes, parent: LandmarkMap | None, whole: LandmarkMap | None = None
+) -> bytes:
     """Return the bytes of a map without what its parent has.
 
     Args:
         data: the whole map, encoded.
         parent: the revision that it names as its parent, decoded; None for a first map.
+        whole: the map, decoded; None: that is done here.
 
     Raises:
         WireError: ``data`` is no map.
         ValueError: it has an image that is taken for a reference.
     """
-    whole, parent = decode_map(data), parent or _NO_MAP
+    whole, parent = whole or decode_map(data), parent or _NO_MAP
     place_of = {keyframe.image_bytes: k for k, keyframe in enumerate(parent.keyframes)}
     places = [place_of.get(keyframe.image_bytes) for keyframe in whole.keyframes]
     keyframes = []
@@ -107,6 +110,28 @@ def without_images(update: bytes, held: Collection[bytes]) -> bytes:
         keyframes.append(replace(keyframe, image_bytes=name) if stays else keyframe)
     head = replace(head, keyframes=tuple(keyframes))
     return _joined(revision, encode_head(head) + reader.rest())
+
+
+def with_images(update: bytes, held: Mapping[bytes, bytes]) -> bytes:
+    """Return an encoded update for one who holds no images, the inverse of ``without_images``.
+
+    Args:
+        update: what came.
+        held: images by their names.
+
+    Raises:
+        WireError: the bytes are no update, or need an image that is not held.
+    """
+    revision, reader = _split(update)
+    head = _head_of(reader)
+    keyframes = tuple(
+        replace(k, image_bytes=_sent_ahead(k, held)) if _is_named(k) else k for k in head.keyframes
+    )
+    try:
+        data = encode_head(replace(head, keyframes=keyframes))
+    except ValueError as error:  # the images may make it longer than peers accept
+        raise WireError(f"map update: {error}") from None
+    return _joined(revision, data + reader.rest())
 
 
 def names_of_update(blob: bytes) -> tuple[bytes, bytes]:
@@ -174,6 +199,10 @@ def _is_reference(keyframe: Keyframe) -> bool:
     return len(keyframe.image_bytes) in (_PLACE.size, _NAME_BYTES)
 
 
+def _is_named(keyframe: Keyframe) -> bool:
+    return len(keyframe.image_bytes) == _NAME_BYTES
+
+
 def _place(keyframe: Keyframe, parent: LandmarkMap) -> int | None:
     """Return which of the parent's keyframes it is; None for a new one."""
     if len(keyframe.image_bytes) != _PLACE.size:
@@ -189,8 +218,11 @@ def _image(
 ) -> bytes:
     if place is not None:
         return parent.keyframes[place].image_bytes
-    if not _is_reference(keyframe):
-        return keyframe.image_bytes
+    return _sent_ahead(keyframe, held) if _is_named(keyframe) else keyframe.image_bytes
+
+
+def _sent_ahead(keyframe: Keyframe, held: Mapping[bytes, bytes]) -> bytes:
+    """Return the image that a keyframe names."""
     image = held.get(keyframe.image_bytes)
     if image is None:
         raise WireError("map update: an image that was sent ahead is not here")
