@@ -26,6 +26,10 @@ MAX_IMAGE_BYTES = 6 * 1024 * 1024
 _LINK = 40
 # What carries frame and scale is worth so many times what it shows.
 _CARRYING = 2.0
+# The newest keyframes of a map stay, so large a share of what it may have: what comes next hangs
+# on them, and takes its scale from what they share. By what each alone shows, all would stay that
+# were there first, and of where the drones are by now none but the last round's.
+_NEWEST = 0.5
 # A distance that is to carry the scale on is at least so long, and not known better than this.
 _LEAST_DISTANCE_M, _FINEST = 0.1, 1e-5
 
@@ -52,9 +56,9 @@ def broken_continuity(old: LandmarkMap, sure: MapUncertainty, growth: Growth) ->
 def pruned(landmark_map: LandmarkMap, n_old: int, options: MapOptions) -> LandmarkMap:
     """Drop keyframes and landmarks that contribute least until the map is within its bounds.
 
-    New keyframes stay. Where the first one goes, or the last known distance, the next one
-    takes its place, as well known as it is by then: what is too old to matter is summed up
-    in that (marginalized).
+    New keyframes stay, and the newest of the old. Where the first one goes, or the last known
+    distance, the next one takes its place, as well known as it is by then: what is too old to
+    matter is summed up in that (marginalized).
 
     Args:
         landmark_map: the extended map.
@@ -75,7 +79,8 @@ def pruned(landmark_map: LandmarkMap, n_old: int, options: MapOptions) -> Landma
         worth = (seen / np.maximum(seen.sum(axis=1, keepdims=True) - 1, 1)).sum(axis=0)
         carrying = {0} | {k for d in landmark_map.distances for k in (d.keyframe_a, d.keyframe_b)}
         worth[list(carrying)] *= _CARRYING
-        k = _least_missed(landmark_map, worth[:n_old])
+        n_older = len(keyframes) - int(_NEWEST * options.max_keyframes)
+        k = _least_missed(landmark_map, worth[: max(min(n_old, n_older), 1)])
         landmark_map = _without(landmark_map, k)
         del left[k]
         n_old -= 1

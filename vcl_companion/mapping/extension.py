@@ -41,8 +41,10 @@ _PARTNERS = 3
 _AGAIN = AlignRules(max_iterations=15, least_score=0.85, max_moved_px=1.5, settled_px=0.02)
 _RELATIVE_SIGMA = 0.02
 _STEPS, _LEAST_GAIN = (8, 12), (1e-3, 1e-4)
-# Old keyframes that an extension may still move.
-_NEAREST = 9
+# Old keyframes that an extension may still move: so many; of a map of more no more than half of
+# those that share so many landmarks with the new views. The other half holds the scale, which
+# would go a little wrong each time with nothing but far keyframes to hold it.
+_NEAREST, _SHARED = 9, 40
 _CAUCHY_PX = 0.5
 # Residuals of patches that are the same spot: first loosely, by poses not adjusted yet.
 _LIMIT_PX = (1.5, 0.5)
@@ -299,8 +301,8 @@ def _adjusted_near(
 ) -> tuple[Views, float]:
     """Adjust the new views, the old keyframes that share most with them, and what these see.
 
-    Farther keyframes are held where they are: what they could still learn is little, and
-    the cost of an extension does not grow with the map.
+    The others are held where they are: what they could still learn is little, frame and scale
+    are theirs, and the cost of an extension does not grow with the map.
 
     Args:
         views: of which the first ``n_keys`` are old.
@@ -316,7 +318,10 @@ def _adjusted_near(
     shared = seen[shown, :n_keys].sum(axis=0)
     moving = np.zeros(len(views.bodies), dtype=bool)
     moving[n_keys:] = True
-    moving[np.argsort(-shared, kind="stable")[:_NEAREST]] = True
+    n_moving = _NEAREST
+    if n_keys > _NEAREST:
+        n_moving = min(_NEAREST, int((shared >= _SHARED).sum()) // 2)
+    moving[np.argsort(-shared, kind="stable")[:n_moving]] = True
     moving[0] = False
     order = np.argsort(moving, kind="stable")
     place = np.argsort(order)
