@@ -137,3 +137,60 @@ def test_nothing_of_a_map_is_seen_from_behind_it(views: list[DroneView]) -> None
     for away in (at(0.0, 0.0, 0.0, 180.0), at(30.0, 0.0, 0.0, 180.0)):
         none = coverage(old, CAMERA, MOUNTING, away)
         assert (none.n_visible, none.share) == (0, 0.0)
+
+
+def test_a_map_that_is_full_goes_on_from_its_newest_half() -> None:
+    """Two drones along a street, thrice as far as they see: the map holds a part of it."""
+    rng = np.random.default_rng(0)
+    scene, n_rounds = panels(rng, 24), 18
+    bodies = [
+        at(0.3 * (-1) ** n * i, -18.0 + 1.5 * n + 2.4 * i, 0.2 * i)
+        for n in range(n_rounds)
+        for i in (0, 1)
+    ]
+    views = [
+        rendered_view(scene, 1 + k % 2, k // 2, body, MOUNTING, OPTIONS)
+        for k, body in enumerate(bodies)
+    ]
+    options = replace(OPTIONS, max_keyframes=12)
+    known = float(np.linalg.norm(bodies[0].translation - bodies[1].translation))
+    found = reconstruct(views[:2], 1, [(1, 2, known)], options)
+    assert isinstance(found, LandmarkMap), found
+    began = found.keyframes[0].world_from_body
+    for n in range(1, n_rounds):
+        shown = [
+            replace(
+                views[k],
+                features=(),
+                world_from_body=found.keyframes[k % 2 - 2].world_from_body
+                @ (bodies[k - 2].inverse() @ bodies[k]).retracted(0.005 * rng.standard_normal(6)),
+            )
+            for k in (2 * n, 2 * n + 1)
+        ]
+        before, found = found, extend_map(found, PARENT, shown, options)
+        assert isinstance(found, LandmarkMap), (n, found)
+        # As many hold what was as are moved.
+        moved = [was is not now for was, now in poses_of_both(before, found)]
+        assert len(before.keyframes) <= 9 or 2 * sum(moved) <= len(moved)
+    newest = [k.captured_at_ns for k in found.keyframes[-6:]]
+    assert newest == [
+        n_rounds - 3,
+        n_rounds - 3,
+        n_rounds - 2,
+        n_rounds - 2,
+        n_rounds - 1,
+        n_rounds - 1,
+    ]
+    flown = found.keyframes[-2].world_from_body.translation - began.translation
+    truth_m = np.linalg.norm(bodies[-2].translation - bodies[0].translation)
+    assert abs(np.linalg.norm(flown) / truth_m - 1.0) < 0.002
+
+
+def poses_of_both(a: LandmarkMap, b: LandmarkMap) -> list[tuple[Pose, Pose]]:
+    """Return the poses of the keyframes that two maps have in common."""
+    of_b = {(k.drone_id, k.captured_at_ns): k.world_from_body for k in b.keyframes}
+    return [
+        (k.world_from_body, of_b[name])
+        for k in a.keyframes
+        if (name := (k.drone_id, k.captured_at_ns)) in of_b
+    ]
