@@ -15,13 +15,24 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import KnownDistance, LandmarkMap
-from vcl_companion.mapping.uncertainty import SHARED_NOISE_PX, map_uncertainty, views_of
+from vcl_companion.mapping.uncertainty import (
+    NOISE_GROWTH,
+    SHARED_NOISE_PX,
+    map_uncertainty,
+    views_of,
+)
 from vcl_companion.vision.bundle import BundleOptions, Distance, adjust, normal_equations
 
 
-def dense_covariance(landmark_map: LandmarkMap) -> Array:
-    """Invert the whole normal matrix: keyframes 1 to V-1, then every landmark."""
-    noise = np.hypot(landmark_map.pixel_noise_px, SHARED_NOISE_PX)
+def dense_covariance(landmark_map: LandmarkMap, looks_before: Array | float = 0.0) -> Array:
+    """Invert the whole normal matrix: keyframes 1 to V-1, then every landmark.
+
+    Args:
+        landmark_map: the map.
+        looks_before: (N, V) how many rounds before had seen a landmark.
+    """
+    shared = SHARED_NOISE_PX * np.sqrt(1.0 + NOISE_GROWTH * np.asarray(looks_before))
+    noise = np.hypot(landmark_map.pixel_noise_px, shared)[..., None, None]
     views = views_of(landmark_map)
     system = normal_equations(replace(views, slopes=views.slopes / noise), None)
     n_poses, n_points = len(system.pose_block), len(system.point_block)
@@ -61,6 +72,28 @@ def test_the_factored_covariance_is_the_dense_inverse(n_views: int, n_landmarks:
         assert_equal(shared[:, 6:], own, poses)
         if j > 0:
             assert_equal(shared @ uncertainty.landmark_lever[0].T, own, other)
+
+
+def test_a_further_round_tells_the_less_of_what_was_seen_before() -> None:
+    """Each drone has a clock of its own; rounds are told apart all the same."""
+    scene = facade_scene(np.random.default_rng(4), 60, relief_m=4.0, n_views=5)
+    taken = [(1, 5), (2, 900_000), (1, 6), (3, 70), (2, 900_001)]
+    made = map_of(scene)
+    observed_px = made.observed_px.copy()
+    observed_px[:20, :2] = np.nan  # these came with the second round
+    observed_px[20:30, 2:4] = np.nan  # and these were seen again by one drone only
+    keyframes = tuple(
+        replace(k, drone_id=drone, captured_at_ns=at_ns)
+        for k, (drone, at_ns) in zip(made.keyframes, taken, strict=True)
+    )
+    later = replace(made, keyframes=keyframes, observed_px=observed_px)
+    looks_before = np.zeros((60, 5))
+    looks_before[20:, 2:] = 1.0
+    dense = dense_covariance(later, looks_before)
+    n = 6 * 4
+    unit = np.outer(*[np.sqrt(np.diag(dense)[:n])] * 2)
+    found = map_uncertainty(later).keyframe_covariance[6:, 6:]
+    np.testing.assert_allclose(found / unit, dense[:n, :n] / unit, atol=1e-6)
 
 
 def noisy_map(rng: np.random.Generator, scene: Scene, sigma_m: float) -> LandmarkMap:

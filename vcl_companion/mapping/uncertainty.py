@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import adjoint
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.vision.bundle import Distance, Views, normal_equations
 from vcl_companion.vision.information import covariance_of
@@ -27,11 +27,11 @@ from vcl_companion.vision.schur import carried, eliminated
 # landmarks of little parallax leaves 1e-12 by rounding.
 _SINGULAR = 1e-11
 # What displaces a feature or a patch is alike in neighbouring ones, so that residuals tell too
-# little of it: it acts on keyframes like so much more independent noise. And from one extension
-# of a map to the next it does not change its sign: what an extension adds to the error grows with
-# how many there were before. NEES of keyframes rose so on rendered flights and on photographs.
+# little of it: it acts on keyframes like so much more independent noise. And from one look at a
+# landmark to the next it does not change its sign: a further one tells the less, the more rounds
+# have seen it before. NEES of keyframes rose so on rendered flights and on photographs.
 SHARED_NOISE_PX = 0.28
-_GROWTH = 1.5
+NOISE_GROWTH = 2.5
 _WIDER = 1.5
 # No distance between drones is known better; much smaller sigmas overflow.
 _FINEST_M = 1e-6
@@ -115,10 +115,10 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
     reduced = np.zeros((6 * n_keyframes, 6 * n_keyframes))
     with np.errstate(all="ignore"):
         # Distances enter in units of their own sigma; pixels in px: bring both to sigmas.
-        noise_px = _noise_px(landmark_map)[:, None, None]
         for some in _portions(n):
-            views = views_of(_of(landmark_map, some))
-            scaled = replace(views, slopes=views.slopes / noise_px)
+            part = _of(landmark_map, some)
+            views = views_of(part)
+            scaled = replace(views, slopes=views.slopes / _noise_px(part)[..., None, None])
             system = normal_equations(scaled, None)
             inverse[some] = _inverse(system.point_block)
             lever[some] = -np.swapaxes(system.cross @ inverse[some], 1, 2)
@@ -144,11 +144,30 @@ def _of(landmark_map: LandmarkMap, some: slice) -> LandmarkMap:
 
 
 def _noise_px(landmark_map: LandmarkMap) -> Array:
-    """Return (V,) noise of the observations in each keyframe, px, 1 sigma."""
-    times = [k.captured_at_ns for k in landmark_map.keyframes]
-    generation = np.searchsorted(np.unique(times), times)
-    shared_px = SHARED_NOISE_PX * np.sqrt(1.0 + _GROWTH * generation)
+    """Return (N, V) noise of the observations, px, 1 sigma."""
+    rounds = _rounds(landmark_map.keyframes)
+    seen = np.zeros((len(landmark_map.points_world), rounds[-1] + 1), dtype=np.int64)
+    for i, k in enumerate(rounds):
+        seen[:, k] |= landmark_map.seen[:, i]
+    before = (np.cumsum(seen, axis=1) - seen)[:, rounds]
+    shared_px = SHARED_NOISE_PX * np.sqrt(1.0 + NOISE_GROWTH * before)
     return np.asarray(np.hypot(landmark_map.pixel_noise_px, shared_px))
+
+
+def _rounds(keyframes: tuple[Keyframe, ...]) -> list[int]:
+    """Return in which round each of V keyframes came; each drone has a clock of its own.
+
+    They are in the order in which they came, and a round has one of each drone; the earlier
+    frames of one that was lost count as rounds of their own.
+    """
+    out: list[int] = []
+    there: set[int] = set()
+    for keyframe in keyframes:
+        if keyframe.drone_id in there:
+            there.clear()
+        out.append((out[-1] if out else -1) + (not there))
+        there.add(keyframe.drone_id)
+    return out
 
 
 def _inverse(information: Array) -> Array:
