@@ -13,8 +13,6 @@ from sitl.plan import FlightPlan, PlannedDrone, Setting
 from vcl_companion.errors import ConfigError
 from vcl_companion.recording.recording import CAMERA_FOLDER
 
-# Distances of the truth, which nobody has measured to a centimetre or so.
-_EXACT_M = 0.001
 _FLAT_OUT_WAIT_S = 30.0
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -33,9 +31,6 @@ def daemon_config(
     calibration = plan.recording.path.resolve() / planned.name / CAMERA_FOLDER / "sensor.yaml"
     if planned.mission is not None:  # the recording is made as it flies
         calibration = run / "sensor.yaml"
-    maps: dict[str, object] = {"directory": str(run / "maps")}
-    if plan.has_true_distances:
-        maps["distance_sigma_m"] = _EXACT_M
     wiring = {
         "system_id": planned.system_id,
         "clock": "camera",
@@ -59,7 +54,7 @@ def daemon_config(
             "flight_log": str(run / "flight.jsonl"),
             "status_file": str(run / "status.json"),
         },
-        "map": maps,
+        "map": {"directory": str(run / "maps")},
     }
     if math.isinf(plan.options.speed):
         # The recording's time stands still meanwhile; the outcome must not hang on the machine.

@@ -130,8 +130,7 @@ def plan_live(scenario: Scenario, out: Path, options: FlyOptions) -> FlightPlan:
     )  # fmt: skip
     plan = plan_flight(recording, options)
     flying = tuple(replace(p, mission=missions[p.name]) for p in plan.drones)
-    # Where a simulated autopilot begins is not to the millimetre where it was put.
-    return replace(plan, drones=flying, has_true_distances=False)
+    return replace(plan, drones=flying)
 
 
 class LiveShots:

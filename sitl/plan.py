@@ -114,7 +114,6 @@ class FlightPlan:
         leader: name of the one whose start is the origin.
         known_distances: (system id, system id, m).
         options: how it is flown.
-        has_true_distances: whether all of these are the truth's, which nobody has measured.
     """
 
     recording: Recording
@@ -122,7 +121,6 @@ class FlightPlan:
     leader: str
     known_distances: tuple[tuple[int, int, float], ...]
     options: FlyOptions
-    has_true_distances: bool
 
     @property
     def starts_at_ns(self) -> int:
@@ -202,14 +200,12 @@ def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:
         if drone.name in flying
     )
     check_flying(options.network.partitions, flying)
-    pairs = _known_pairs(recording, drones, options.known_distances)
     plan = FlightPlan(
         recording=recording,
         drones=drones,
         leader=recording.leader if recording.leader in flying else flying[0],
-        known_distances=_known_distances(recording, drones, pairs),
+        known_distances=_known_distances(recording, drones, options.known_distances),
         options=options,
-        has_true_distances=all(pair.distance_m is None for pair in pairs),
     )
     check_absences(options.absences, flying, (plan.ends_at_ns - plan.starts_at_ns) * 1e-9)
     return plan
@@ -232,10 +228,9 @@ def _attitude_path(drone: Drone, options: FlyOptions) -> Path | None:
     return None
 
 
-def _known_pairs(
+def _known_distances(
     recording: Recording, drones: Sequence[PlannedDrone], given: Sequence[KnownPair]
-) -> Sequence[KnownPair]:
-    """Return the pairs that were given, else the recording's that fly."""
+) -> tuple[tuple[int, int, float], ...]:
     by_name = {drone.name: drone for drone in drones}
     for pair in given:
         for name in (pair.a, pair.b):
@@ -248,13 +243,6 @@ def _known_pairs(
             f"{recording.path}: no distance is known between two of {', '.join(by_name)}; "
             f"give --known-distance {a}:{b}=METRES"
         )
-    return pairs
-
-
-def _known_distances(
-    recording: Recording, drones: Sequence[PlannedDrone], pairs: Sequence[KnownPair]
-) -> tuple[tuple[int, int, float], ...]:
-    by_name = {drone.name: drone for drone in drones}
     out = []
     for pair in pairs:
         one, other = by_name[pair.a], by_name[pair.b]

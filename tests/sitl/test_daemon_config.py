@@ -10,7 +10,7 @@ from sitl.daemon_config import daemon_config, toml_text, with_settings
 from sitl.plan import FlyOptions, Setting, plan_flight
 from tests.sitl.flights import Flight, write_recording
 from vcl_companion.errors import ConfigError
-from vcl_companion.recording import KnownPair, read_recording
+from vcl_companion.recording import read_recording
 
 SCALARS = (
     st.booleans()
@@ -31,14 +31,6 @@ TABLES = st.recursive(
 @given(TABLES)
 def test_any_configuration_reads_back(config: dict[str, Any]) -> None:
     assert tomllib.loads(toml_text(config)) == config
-
-
-def test_a_distance_that_is_the_truth_s_is_not_one_to_a_centimetre(tmp_path: Path) -> None:
-    recording = read_recording(write_recording(tmp_path, Flight(n_frames=2, n_drones=2)))
-    plan = plan_flight(recording, FlyOptions(known_distances=(KnownPair("mav0", "mav1"),)))
-    config = daemon_config(plan, plan.drones[0], tmp_path / "out", 5001, 5002, 5003, [5004])
-    assert config["map"]["distance_sigma_m"] == 0.001
-    assert len(config["swarm"]["known_distances"]) == 1
 
 
 def test_a_later_setting_wins_and_the_base_is_left_alone() -> None:
