@@ -42,7 +42,12 @@ from sitl.autopilots.steered import open_udp, run_steered, serve
 from sitl.autopilots.vision_north import VisionNorth
 from vcl_companion.daemon.scheduling import run_before_others
 from vcl_companion.errors import ConfigError
-from vcl_companion.geometry.rotation import Array, euler_from_matrix, matrix_from_quaternion
+from vcl_companion.geometry.rotation import (
+    Array,
+    euler_from_matrix,
+    log_so3,
+    matrix_from_quaternion,
+)
 
 # An ArduCopter's that flies on our poses.
 PARAMETERS = {
@@ -144,6 +149,7 @@ class StandIn:
         is_measured = isinstance(options.source, TruthAttitude)
         by_vision = self._parameters[_YAW_SOURCE] == _BY_VISION
         self._north = VisionNorth() if is_measured and by_vision else None
+        self._turned: tuple[int, Array] | None = None
         # latitude and longitude, 1e-7 degrees, altitude, mm: as ArduPilot it keeps its first
         self._origin: tuple[int, int, int] | None = None
         self._streams = {
@@ -316,6 +322,7 @@ class StandIn:
         boot_ms = (at_ns - self._options.boot_offset_ns) // 1_000_000
         if not 0 <= boot_ms < 2**32:
             raise ConfigError(f"boot_offset_ns: {at_ns} is {boot_ms} ms after the start")
+        rates = self._felt(at_ns, matrix_from_quaternion(quaternion))
         if self._north is not None:
             quaternion = self._north.of(at_ns, quaternion)
         # The wire has float32: what is kept is what was sent.
@@ -323,10 +330,18 @@ class StandIn:
         self._attitudes.write(f"{at_ns},{','.join(map(repr, sent))}\n")
         angles = euler_from_matrix(matrix_from_quaternion(np.array(sent)))
         for message in (
-            dialect.MAVLink_attitude_quaternion_message(boot_ms, *sent, 0.0, 0.0, 0.0),
-            dialect.MAVLink_attitude_message(boot_ms, *angles, 0.0, 0.0, 0.0),
+            dialect.MAVLink_attitude_quaternion_message(boot_ms, *sent, *rates),
+            dialect.MAVLink_attitude_message(boot_ms, *angles, *rates),
         ):
             self._backlog.add(at_ns, self._send(message))
+
+    def _felt(self, at_ns: int, ned_from_body: Array) -> list[float]:
+        """Return what its gyros feel, body rates since the last attitude, rad/s."""
+        last, self._turned = self._turned, (at_ns, ned_from_body)
+        if last is None or at_ns <= last[0]:
+            return [0.0, 0.0, 0.0]
+        turn = log_so3(last[1].T @ ned_from_body)
+        return [float(angle) * 1e9 / (at_ns - last[0]) for angle in turn]
 
     def _send(self, message: Any) -> bytes:
         frame = packed(message, self._mav)

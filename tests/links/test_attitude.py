@@ -194,6 +194,29 @@ def test_a_drone_that_begins_to_spin_turns_itself() -> None:
         assert ours.add(AttitudeSample(1, 1, 1000 + 20 * k, turned, "quaternion"), 0) == "taken"
 
 
+@pytest.mark.parametrize("has_gyros", [True, False])
+def test_what_the_gyros_feel_is_no_turn_of_the_north(has_gyros: bool) -> None:
+    """Photographs flown at: a drone that turns between them begins and ends that at once."""
+    ours, heading, taken = history(), 0.0, []
+    for k in range(60):
+        rate = 4.0 * (k // 10 % 2)
+        heading += 0.02 * rate
+        turned = exp_so3(np.array([0.0, 0.0, heading]))
+        felt = rate if has_gyros else None
+        taken.append(ours.add(AttitudeSample(1, 1, 1000 + 20 * k, turned, "quaternion", felt), 0))
+    assert ("turned" in taken) != has_gyros
+
+
+def test_the_gyros_do_not_feel_a_turn_of_the_north() -> None:
+    ours = history()
+    for k in range(60):
+        heading = 0.02 * k + NORTH_RAD * (k >= 30)
+        turned = exp_so3(np.array([0.0, 0.0, heading]))
+        taken = ours.add(AttitudeSample(1, 1, 1000 + 20 * k, turned, "quaternion", 1.0), 0)
+        assert taken == ("turned" if k == 30 else "taken")
+    assert np.isclose(ours.north_rad, NORTH_RAD, rtol=1e-6)
+
+
 def test_a_restarted_autopilot_has_a_new_north() -> None:
     ours = flown(list(range(5000 * MS, 7000 * MS, 20 * MS)), 6000 * MS)
     assert ours.add(sample(100 * MS), 0) == "rebooted"

@@ -5,8 +5,9 @@ turned into our time only when an attitude is asked for, by the best offset
 known then.
 
 An autopilot that begins to take its heading from our poses turns its north at once, by what it
-was wrong. Nobody turns so fast: its attitudes are told on as if it had not. One that was told no
-pose yet has found its north by itself, as a PX4 does by its compass soon after its start.
+was wrong. Nobody turns so fast, and its gyros do not feel it: its attitudes are told on as if it
+had not. One that was told no pose yet has found its north by itself, as a PX4 does by its compass
+soon after its start.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ _CARRIED_NS = 25_000_000
 _CARRIED_STEPS = 1.25
 
 # What a heading changes by beyond its last rate is the autopilot's doing when it is more than
-# the noise of two samples, and more than a drone can accelerate its turn.
+# the noise of two samples, more than a drone can accelerate its turn, and not between what the
+# gyros say at both samples.
 _HEADING_NOISE_RAD = math.radians(1.5)
 _HEADING_ACCELERATION_RAD_S2 = 20.0
 # A rate is by samples at least so far from each other, as a share of how long it is carried on.
@@ -214,11 +216,12 @@ class AttitudeHistory:
         step_s = self._s_between(before, last)
         if step_s <= 0.0:
             return 0.0
-        expected_rad = _heading_change(before, last) * since_s / step_s
-        beyond_rad = _heading_change(last, sample) - expected_rad
+        change_rad = _heading_change(last, sample)
+        beyond_rad = change_rad - _heading_change(before, last) * since_s / step_s
         possible_rad = _HEADING_NOISE_RAD * max(1.0, since_s / step_s)
         possible_rad += _HEADING_ACCELERATION_RAD_S2 * since_s * max(step_s, since_s)
-        return beyond_rad if abs(beyond_rad) > possible_rad else 0.0
+        is_own = abs(beyond_rad) <= possible_rad or _is_felt(change_rad, since_s, last, sample)
+        return 0.0 if is_own else beyond_rad
 
     def _far_enough_back(self, since_s: float) -> AttitudeSample:
         """Return the sample to take the rate by that is carried on for so long; of two or more.
@@ -245,6 +248,15 @@ class AttitudeHistory:
 def _heading_change(before: AttitudeSample, after: AttitudeSample) -> float:
     """Return by how much a body turned about the vertical from one sample to another, rad."""
     return float(log_so3(after.ned_from_body @ before.ned_from_body.T)[2])
+
+
+def _is_felt(change_rad: float, since_s: float, *samples: AttitudeSample) -> bool:
+    """Whether a change of heading lies between what the gyros say at these samples."""
+    known = [s.heading_rate_rad_s for s in samples if s.heading_rate_rad_s is not None]
+    if not known:
+        return False
+    least, most = min(known) * since_s, max(known) * since_s
+    return least - _HEADING_NOISE_RAD <= change_rad <= most + _HEADING_NOISE_RAD
 
 
 def _on_arc(before: AttitudeSample, after: AttitudeSample, fraction: float) -> Array:

@@ -59,11 +59,13 @@ class AttitudeSample(Message):
         time_boot_ms: milliseconds since the autopilot's start, cut off, not rounded.
         ned_from_body: (3, 3) rotation.
         source: the message that it came in.
+        heading_rate_rad_s: how fast its gyros say that it turns about down; None for unknown.
     """
 
     time_boot_ms: int
     ned_from_body: Array
     source: Literal["quaternion", "euler"]
+    heading_rate_rad_s: float | None = None
 
     def __post_init__(self) -> None:
         if self.ned_from_body.shape != (3, 3):

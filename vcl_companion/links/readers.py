@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vcl_companion.geometry.rotation import matrix_from_euler, matrix_from_quaternion
+from vcl_companion.geometry.rotation import Array, matrix_from_euler, matrix_from_quaternion
 from vcl_companion.links.messages import (
     COMPONENT_COMPANION,
     MAX_TUNNEL_BYTES,
@@ -60,7 +60,8 @@ def _attitude(m: Any, sender: _Sender) -> Message | str:
     angles = (m.roll, m.pitch, m.yaw)
     if not all(map(math.isfinite, angles)):
         return "attitude is no rotation"
-    return AttitudeSample(*sender, m.time_boot_ms, matrix_from_euler(*angles), "euler")
+    rotation = matrix_from_euler(*angles)
+    return AttitudeSample(*sender, m.time_boot_ms, rotation, "euler", _heading_rate(m, rotation))
 
 
 def _attitude_quaternion(m: Any, sender: _Sender) -> Message | str:
@@ -69,7 +70,14 @@ def _attitude_quaternion(m: Any, sender: _Sender) -> Message | str:
     if not abs(float(np.linalg.norm(quaternion)) - 1.0) < _QUATERNION_NORM_TOLERANCE:
         return "attitude is no rotation"
     rotation = matrix_from_quaternion(quaternion)
-    return AttitudeSample(*sender, m.time_boot_ms, rotation, "quaternion")
+    rate = _heading_rate(m, rotation)
+    return AttitudeSample(*sender, m.time_boot_ms, rotation, "quaternion", rate)
+
+
+def _heading_rate(m: Any, ned_from_body: Array) -> float | None:
+    """Return the rate about down of the body rates of either message; None where they are none."""
+    rate = float(ned_from_body[2] @ np.array([m.rollspeed, m.pitchspeed, m.yawspeed]))
+    return rate if math.isfinite(rate) else None
 
 
 def _ekf_status_report(m: Any, sender: _Sender) -> Message | str:
