@@ -257,7 +257,9 @@ def test_its_errors_are_what_it_states(tmp_path: Path) -> None:
     assert 0.1 * 0.96 < float(np.std(whites_deg)) * math.sqrt(6 / 5) < 0.1 * 1.04
 
 
-def test_who_turns_at_once_from_photograph_to_photograph_keeps_the_north(tmp_path: Path) -> None:
+def test_who_turns_at_once_from_photograph_to_photograph_keeps_the_north(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """What its gyros feel is told with its attitude: it is no turn of the autopilot's north."""
     out, path = tmp_path / "mav", tmp_path / "truth.csv"
     rows = ["at_ns,x,y,z,qw,qx,qy,qz"]
@@ -267,7 +269,9 @@ def test_who_turns_at_once_from_photograph_to_photograph_keeps_the_north(tmp_pat
     path.write_text("\n".join(rows) + "\n")
     source: dict[str, object] = {"source": "truth", "file": str(path), "seed": 4, "rate_hz": 50}
     frames_at_ns = [START_NS + k * 100 * MS for k in range(15)]
-    found = attitudes_of(frames_at_ns, out, source)
+    with caplog.at_level("INFO"):
+        found = attitudes_of(frames_at_ns, out, source)
+    assert "north" not in caplog.text
     sent = dict(zip(*attitude_rows(out), strict=True))
     for at_ns, rotation in zip(frames_at_ns, found, strict=True):
         assert angle_deg(matrix_from_quaternion(sent[at_ns]), rotation) < 1.0
