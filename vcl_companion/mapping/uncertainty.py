@@ -145,11 +145,11 @@ def _of(landmark_map: LandmarkMap, some: slice) -> LandmarkMap:
 
 def _noise_px(landmark_map: LandmarkMap) -> Array:
     """Return (N, V) noise of the observations, px, 1 sigma."""
-    rounds = _rounds(landmark_map.keyframes)
-    seen = np.zeros((len(landmark_map.points_world), rounds[-1] + 1), dtype=np.int64)
+    rounds, seen = _rounds(landmark_map.keyframes), landmark_map.seen
+    in_round = np.zeros((len(seen), rounds[-1] + 1), dtype=np.int64)
     for i, k in enumerate(rounds):
-        seen[:, k] |= landmark_map.seen[:, i]
-    before = (np.cumsum(seen, axis=1) - seen)[:, rounds]
+        in_round[:, k] |= seen[:, i]
+    before = (np.cumsum(in_round, axis=1) - in_round)[:, rounds]
     shared_px = SHARED_NOISE_PX * np.sqrt(1.0 + NOISE_GROWTH * before)
     return np.asarray(np.hypot(landmark_map.pixel_noise_px, shared_px))
 
