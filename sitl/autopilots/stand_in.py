@@ -146,9 +146,9 @@ class StandIn:
         self._next_heartbeat_s = 0.0
         self._parameters = {**PARAMETERS, **options.parameters}
         # What an earlier flight's autopilot said had its north already.
-        is_measured = isinstance(options.source, TruthAttitude)
+        self._is_measured = isinstance(options.source, TruthAttitude)
         by_vision = self._parameters[_YAW_SOURCE] == _BY_VISION
-        self._north = VisionNorth() if is_measured and by_vision else None
+        self._north = VisionNorth() if self._is_measured and by_vision else None
         self._turned: tuple[int, Array] | None = None
         # latitude and longitude, 1e-7 degrees, altitude, mm: as ArduPilot it keeps its first
         self._origin: tuple[int, int, int] | None = None
@@ -336,9 +336,12 @@ class StandIn:
             self._backlog.add(at_ns, self._send(message))
 
     def _felt(self, at_ns: int, ned_from_body: Array) -> list[float]:
-        """Return what its gyros feel, body rates since the last attitude, rad/s."""
+        """Return what its gyros feel, body rates since the last attitude, rad/s.
+
+        Of an earlier flight's autopilot only the attitudes are known, turns of its north in them.
+        """
         last, self._turned = self._turned, (at_ns, ned_from_body)
-        if last is None or at_ns <= last[0]:
+        if last is None or at_ns <= last[0] or not self._is_measured:
             return [0.0, 0.0, 0.0]
         turn = log_so3(last[1].T @ ned_from_body)
         return [float(angle) * 1e9 / (at_ns - last[0]) for angle in turn]
