@@ -25,6 +25,7 @@ from vcl_companion.vision.patches import (
     KeyframeImages,
     Pyramid,
     align_patches,
+    laid_out,
     lens_of,
     pyramid_of,
 )
@@ -91,12 +92,7 @@ class PatchTable:
         usable = [p for p in pyramids if p is not None]
         n_levels = min((len(p.shelves) for p in usable), default=1)
         empty = Pyramid(np.zeros(1, np.uint8), np.array([[0, 1, 1]] * n_levels, dtype=np.int64))
-        shown = [p or empty for p in pyramids]
-        starts = np.concatenate([[0], np.cumsum([len(p.texels) for p in shown])[:-1]])
-        self._texels = np.concatenate([p.texels for p in shown])
-        self._shelves = np.stack(
-            [p.shelves[:n_levels] + np.array([s, 0, 0]) for p, s in zip(shown, starts, strict=True)]
-        ).astype(np.int64)
+        self._texels, self._shelves = laid_out([p or empty for p in pyramids])
 
     @property
     def n_views(self) -> int:

@@ -175,18 +175,22 @@ class KeyframeImages:
         return out
 
 
-def keyframe_images(pyramids: list[Pyramid], worlds_from_cams: list[Pose]) -> KeyframeImages:
-    """Lay out the images of V keyframes; all get as many levels as the smallest has."""
+def laid_out(pyramids: list[Pyramid]) -> tuple[NDArray[np.uint8], Ints]:
+    """Return the texels of V images in one array, and (V, L, 3) where each level lies in it.
+
+    All get as many levels as the smallest has; see ``Pyramid``.
+    """
     n_levels = min(len(p.shelves) for p in pyramids)
     starts = np.concatenate([[0], np.cumsum([len(p.texels) for p in pyramids])[:-1]])
     shelves = np.stack(
         [p.shelves[:n_levels] + np.array([s, 0, 0]) for p, s in zip(pyramids, starts, strict=True)]
     )
-    return KeyframeImages(
-        np.concatenate([p.texels for p in pyramids]),
-        shelves.astype(np.int64),
-        tuple(worlds_from_cams),
-    )
+    return np.concatenate([p.texels for p in pyramids]), shelves.astype(np.int64)
+
+
+def keyframe_images(pyramids: list[Pyramid], worlds_from_cams: list[Pose]) -> KeyframeImages:
+    """Lay out the images of V keyframes."""
+    return KeyframeImages(*laid_out(pyramids), tuple(worlds_from_cams))
 
 
 @dataclass(frozen=True)

@@ -91,8 +91,7 @@ def images_missing_in(update: bytes) -> frozenset[bytes]:
         WireError: the bytes are no update.
     """
     _, reader = _split(update)
-    images = (keyframe.image_bytes for keyframe in _head_of(reader).keyframes)
-    return frozenset(image for image in images if len(image) == _NAME_BYTES)
+    return frozenset(k.image_bytes for k in _head_of(reader).keyframes if _is_named(k))
 
 
 def without_images(update: bytes, held: Collection[bytes]) -> bytes:
