@@ -217,6 +217,29 @@ def test_the_gyros_do_not_feel_a_turn_of_the_north() -> None:
     assert np.isclose(ours.north_rad, NORTH_RAD, rtol=1e-6)
 
 
+@pytest.mark.parametrize("rate", [0.0, -2.8])
+def test_the_gyros_tell_of_a_north_that_turns_before_the_second_sample(rate: float) -> None:
+    """One that takes its heading from the first pose, told when it had spoken once."""
+    ours = history()
+    for k in range(10):
+        heading = 0.02 * k * rate + np.deg2rad(47.0) * (k >= 1)
+        turned = exp_so3(np.array([0.0, 0.0, heading]))
+        taken = ours.add(AttitudeSample(1, 1, 1000 + 20 * k, turned, "quaternion", rate), 0)
+        assert taken == ("turned" if k == 1 else "taken")
+    assert np.isclose(ours.north_rad, np.deg2rad(47.0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("later_ms", [20, 1000])
+def test_a_turn_before_the_second_sample_is_the_drones_if_it_can_be(later_ms: int) -> None:
+    ours = history()
+    for k, rate in enumerate((0.0, 4.0)):
+        heading = 2.0 * k * min(0.02 * later_ms / 20, 0.7)
+        turned = exp_so3(np.array([0.0, 0.0, heading]))
+        sample_ms = 1000 + later_ms * k
+        assert ours.add(AttitudeSample(1, 1, sample_ms, turned, "quaternion", rate), 0) == "taken"
+    assert ours.north_rad == 0.0
+
+
 def test_a_restarted_autopilot_has_a_new_north() -> None:
     ours = flown(list(range(5000 * MS, 7000 * MS, 20 * MS)), 6000 * MS)
     assert ours.add(sample(100 * MS), 0) == "rebooted"

@@ -208,20 +208,31 @@ class AttitudeHistory:
 
     def _turned_by(self, sample: AttitudeSample) -> float:
         """Return by how much the autopilot turned its north before a sample, rad; 0 if not."""
-        if len(self._samples) < 2:
+        if not self._samples:
             return 0.0
         last = self._samples[-1]
         since_s = self._s_between(last, sample)
-        before = self._far_enough_back(since_s)
-        step_s = self._s_between(before, last)
-        if step_s <= 0.0:
+        expected = self._rate_before(since_s) or _rate_felt(since_s, last, sample)
+        if expected is None:
             return 0.0
+        rate_rad_s, step_s = expected
         change_rad = _heading_change(last, sample)
-        beyond_rad = change_rad - _heading_change(before, last) * since_s / step_s
+        beyond_rad = change_rad - rate_rad_s * since_s
         possible_rad = _HEADING_NOISE_RAD * max(1.0, since_s / step_s)
         possible_rad += _HEADING_ACCELERATION_RAD_S2 * since_s * max(step_s, since_s)
         is_own = abs(beyond_rad) <= possible_rad or _is_felt(change_rad, since_s, last, sample)
         return 0.0 if is_own else beyond_rad
+
+    def _rate_before(self, since_s: float) -> tuple[float, float] | None:
+        """Return the rate to carry on for so long, rad/s, and the time that it is by; None: none.
+
+        Both by the samples before, of which one is too few.
+        """
+        if len(self._samples) < 2:
+            return None
+        before, last = self._far_enough_back(since_s), self._samples[-1]
+        step_s = self._s_between(before, last)
+        return (_heading_change(before, last) / step_s, step_s) if step_s > 0.0 else None
 
     def _far_enough_back(self, since_s: float) -> AttitudeSample:
         """Return the sample to take the rate by that is carried on for so long; of two or more.
@@ -248,6 +259,17 @@ class AttitudeHistory:
 def _heading_change(before: AttitudeSample, after: AttitudeSample) -> float:
     """Return by how much a body turned about the vertical from one sample to another, rad."""
     return float(log_so3(after.ned_from_body @ before.ned_from_body.T)[2])
+
+
+def _rate_felt(since_s: float, *samples: AttitudeSample) -> tuple[float, float] | None:
+    """Return the mean of what the gyros say at samples so far apart, and that time.
+
+    None where one does not say, or there is no time between them.
+    """
+    rates = [s.heading_rate_rad_s for s in samples if s.heading_rate_rad_s is not None]
+    if len(rates) < len(samples) or since_s <= 0.0:
+        return None
+    return sum(rates) / len(rates), since_s
 
 
 def _is_felt(change_rad: float, since_s: float, *samples: AttitudeSample) -> bool:
