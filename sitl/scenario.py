@@ -55,7 +55,15 @@ class Lens(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     roll_pitch_yaw_deg: Triple = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        self.camera()
+        camera = self.camera()
+        # Half a pixel outwards: what is rendered of a pixel is its area.
+        right, bottom = camera.width_px - 0.5, camera.height_px - 0.5
+        corners = np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]])
+        if not np.isfinite(camera.ideal_from_pixels(corners)).all():
+            raise ValueError(
+                "camera: its corners look 90 degrees or more aside, or the distortion folds "
+                "before them; a longer focal_px or a smaller image is needed"
+            )
 
     def camera(self) -> Camera:
         """Return the intrinsics."""
@@ -221,8 +229,7 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
             known = ", ".join(scenario_names())
             raise ConfigError(f"no scenario {str(name_or_path)!r}; there are: {known}")
     table = _table(path)
-    base = table.pop("based_on", None)
-    if base is not None:
+    while (base := table.pop("based_on", None)) is not None:
         if base not in scenario_names():
             known = ", ".join(scenario_names())
             raise ConfigError(f"{path}: based_on is one of {known}; got {base!r}")

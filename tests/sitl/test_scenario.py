@@ -77,6 +77,7 @@ def test_every_scenario_that_comes_with_the_harness_loads() -> None:
         ("width_m = 8.0", 'width_m = "wide"', r"float.*str.*world.building\[0\].width_m"),
         ("x_m = 9.0\n", "", "missing required field `x_m`"),
         ("focal_px = 60.0", "focal_px = -1.0", "must be positive.*camera"),
+        ("0.01, 0.0, 0.0]", "-0.6, 0.0, 0.0]", "camera: its corners look 90 degrees.*camera"),
         ("[-0.1, 0.01, 0.0, 0.0]", "[-0.1]", "coefficients"),
         ('["mav0", "mav1"]', '["mav0", "mav7"]', "no drone 'mav7'"),
         ('name = "mav1"', 'name = "mav0"', "different names"),
@@ -107,6 +108,9 @@ def test_a_scenario_based_on_another_replaces_top_level_keys_only(tmp_path: Path
     assert (changed.name, changed.duration_s) == ("longer", 20.0)
     assert changed.drone == base.drone
     assert changed.world == base.world
+    near = load_scenario("forward_back_near")
+    darker = load_text(tmp_path, 'based_on = "forward_back_near"\n[image]\ngain = 0.3\n')
+    assert (darker.drone, darker.world, darker.image.gain) == (near.drone, near.world, 0.3)
     with pytest.raises(ConfigError, match=r"based_on is one of .*demo.*'nowhere'"):
         load_text(tmp_path, 'based_on = "nowhere"')
 
