@@ -96,6 +96,26 @@ def test_what_fills_less_and_less_and_what_looks_ever_newer_is_foreseen() -> Non
     assert not seen(still + [Sight(PLENTY, 0.95 - 0.002 * k, 0.001, 1.0) for k in range(12)])
 
 
+@pytest.mark.parametrize(("there_deg", "votes"), [(4.0, False), (6.0, True), (None, True)])
+def test_what_looks_ever_newer_is_no_news_on_the_way_to_a_place_that_the_map_knows(
+    there_deg: float | None, votes: bool
+) -> None:
+    asked: list[float] = []
+
+    def ahead(ahead_s: float) -> float | None:
+        asked.append(ahead_s)
+        return there_deg
+
+    vote = OwnVote(OPTIONS, ahead)
+    newer = [1.0] * 20 + [1.0 + 0.2 * k for k in range(12)]
+    seen = [Sight(PLENTY, 0.95, 0.001, novelty) for novelty in newer]
+    assert [vote.look(FIRST, sight, k * STEP_S) for k, sight in enumerate(seen)][-1] is votes
+    assert set(asked) == {OPTIONS.ahead_s}
+    # Here it is new already, whatever comes.
+    here = [Sight(PLENTY, 0.95, 0.001, OPTIONS.novelty_deg + 0.1)] * 20
+    assert [vote.look(FIRST, sight, 4.0 + k * STEP_S) for k, sight in enumerate(here)][-1]
+
+
 def test_a_vote_stands_until_the_new_map_has_been_seen_for_a_while() -> None:
     vote = OwnVote(OPTIONS)
     for k in range(20):

@@ -126,6 +126,17 @@ class Estimator:
             return math.inf
         return float(np.sqrt(np.linalg.eigvalsh(state.pose_covariance()[:3, :3])[-1]))
 
+    def course(self, ahead_s: float) -> Pose | None:
+        """Return where we shall be in so many seconds, flying on and looking as now.
+
+        None without a state.
+        """
+        state = self._history.newest
+        if state is None:
+            return None
+        pose = state.world_from_body
+        return Pose(pose.rotation, pose.translation + ahead_s * state.velocity_world)
+
     def forget(self) -> None:
         """Know nothing of where we are any more: the next frame is looked for everywhere."""
         self._history.clear()
@@ -135,6 +146,10 @@ class Estimator:
     def own_fix_at(self, at_ns: int) -> FilterState | None:
         """Return what was believed at a frame that had a fix of its own; None at any other."""
         return self._history.own_fix_at(at_ns)
+
+    def fix_at(self, at_ns: int) -> Localized | None:
+        """Return what a frame gave of its own; None when that was nothing."""
+        return self._history.fix_at(at_ns)
 
     def has_looked_at(self, at_ns: int) -> bool:
         """Whether the frame of an instant, or a later one, has been looked at."""

@@ -177,7 +177,9 @@ class Exchange:
             RoundOptions(options.map, options.update),
             rng,
         )
-        self._own_state = OwnState(group, maps, estimator, clock, log, options.update, self._send)
+        self._own_state = OwnState(
+            group, maps, estimator, sensor, clock, log, options.update, self._send
+        )
         self._sharing = MapSharing(
             group,
             transfers,

@@ -9,6 +9,8 @@ from vcl_companion.clock import Clock
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.localization.outlook import novelty_from
+from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.updates import OwnVote, Sight, UpdateOptions
 from vcl_companion.wire.messages import MAX_TRACKED, MapState
@@ -29,6 +31,7 @@ class OwnState:
         group: whom it is told, and what of it is theirs.
         maps: what we fly on.
         estimator: where we are, and what we see of the map.
+        sensor: of our camera.
         clock: time base of frames.
         log: told of teams.
         options: when the map is to be updated.
@@ -40,6 +43,7 @@ class OwnState:
         group: Group,
         maps: MapStore,
         estimator: Estimator,
+        sensor: Sensor,
         clock: Clock,
         log: FlightLog,
         options: UpdateOptions,
@@ -51,7 +55,8 @@ class OwnState:
         self._clock = clock
         self._log = log
         self._send = send
-        self._vote = OwnVote(options)
+        self._sensor = sensor
+        self._vote = OwnVote(options, self._novelty_ahead_deg)
         self._wants_update = False
         self.is_asked_for_update = False
         """Whether the ground wants the map updated: then so do we."""
@@ -117,6 +122,13 @@ class OwnState:
         )
         self._wants_update |= self.is_asked_for_update and stored is not None
         return self._wants_update != before
+
+    def _novelty_ahead_deg(self, ahead_s: float) -> float | None:
+        stored, there = self._maps.current, self._estimator.course(ahead_s)
+        if stored is None or there is None:
+            return None
+        camera, mounting = self._sensor.camera, self._sensor.body_from_cam
+        return novelty_from(stored.index.landmark_map, there @ mounting, camera)
 
     def _interval_s(self) -> float:
         """How long after the last state the next one is told."""

@@ -7,23 +7,27 @@ import numpy as np
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.rotation import Array
 
+NEAR_DEG = 7.0
+"""A view no newer than this is joined with a map by its patches alone: more than what a flight has
+come when it wants the map extended. Photographs metres apart are farther."""
+
 _COLUMNS, _ROWS = 8, 6
 # A patch bears a turn of so many degrees as well as being seen twice as large or small.
 _OCTAVE_DEG = 15.0
 _LEAST_M = 1e-9
 
 
-def novelty_deg(points: Array, now: Array, then: Array) -> float:
+def novelties_deg(points: Array, now: Array, then: Array) -> Array:
     """Return how differently landmarks look from here than from where they are remembered.
 
     Args:
-        points: (M, 3) landmarks, world, m; M at least 1.
+        points: (M, 3) landmarks, world, m.
         now: (3,) where the camera is.
-        then: (M, 3) where the camera was that remembers each.
+        then: (M, 3) where the camera was that remembers each, or (3,) for all.
 
     Returns:
-        Median of the angle between the lines of sight, degrees, and of a step in size:
-        a doubling or halving of the distance counts like 15 degrees.
+        (M,) angle between the lines of sight, degrees, and the step in size: a doubling or
+        halving of the distance counts like 15 degrees.
     """
     ray, before = points - now, points - then
     squared = np.maximum(np.einsum("mi,mi->m", ray, ray), _LEAST_M**2)
@@ -31,7 +35,12 @@ def novelty_deg(points: Array, now: Array, then: Array) -> float:
     cosine = np.einsum("mi,mi->m", ray, before) / np.sqrt(squared * squared_then)
     angle_deg = np.rad2deg(np.arccos(np.minimum(np.maximum(cosine, -1.0), 1.0)))
     octaves = 0.5 * np.log2(squared / squared_then)
-    return float(np.median(np.hypot(angle_deg, _OCTAVE_DEG * octaves)))
+    return np.asarray(np.hypot(angle_deg, _OCTAVE_DEG * octaves))
+
+
+def novelty_deg(points: Array, now: Array, then: Array) -> float:
+    """Return the median of ``novelties_deg``; M is at least 1."""
+    return float(np.median(novelties_deg(points, now, then)))
 
 
 def covered_share(pixels: Array, camera: Camera) -> float:

@@ -67,8 +67,12 @@ class PoseHistory:
 
     def own_fix_at(self, at_ns: int) -> FilterState | None:
         """Return the state after the frame of an instant, if the frame gave a fix of its own."""
+        return None if self.fix_at(at_ns) is None else self.at(at_ns)
+
+    def fix_at(self, at_ns: int) -> Localized | None:
+        """Return what the frame of an instant gave of its own; None when that was nothing."""
         k = self._nearest(at_ns)
-        return None if k is None or self._steps[k].fix is None else self._steps[k].state
+        return None if k is None else self._steps[k].fix
 
     def clear(self) -> None:
         """Forget everything: the state has begun anew."""

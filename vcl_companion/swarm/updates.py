@@ -9,7 +9,8 @@ as long from now as the last update took, from the vote to the map):
 * covered share of the image < min(``covered``, 0.8 x most since this revision):
   sky is never covered, and no reason to update again and again;
 * median novelty of what is seen > ``novelty_deg``: from a new place the map is still
-  recognised, and soon no more, and here it can be joined to what comes;
+  recognised, and soon no more, and here it can be joined to what comes; foreseen only where
+  the map, asked about the place that the drone is on its way to, does not know that either;
 * 1-sigma of the position > max(``sigma_m``, ``sigma_growth`` x least since this
   revision): what is known no better than that only gets worse, and is
   inherited by whatever is added to the map later.
@@ -23,6 +24,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from vcl_companion.swarm.group import Group
@@ -149,12 +151,22 @@ class Sight:
 class OwnVote:
     """Whether this drone wants its map updated, by what it has seen of it lately.
 
+    Args:
+        options: what it goes by.
+        novelty_ahead_deg: how new the map will look where the drone is in so many seconds, if
+            it flies on as it does; None where nobody can tell.
+
     Attributes:
         options: what it goes by; may be changed.
     """
 
-    def __init__(self, options: UpdateOptions) -> None:
+    def __init__(
+        self,
+        options: UpdateOptions,
+        novelty_ahead_deg: Callable[[float], float | None] = lambda ahead_s: None,
+    ) -> None:
         self.options = options
+        self._novelty_ahead_deg = novelty_ahead_deg
         self._revision = b""
         self._seen: deque[tuple[float, Sight]] = deque()
         self._since_s = 0.0
@@ -226,7 +238,12 @@ class OwnVote:
     def _is_new(self) -> bool:
         seen = [(at_s, s.novelty_deg) for at_s, s in self._seen]
         lately_deg = statistics.median_low(novelty for _, novelty in seen)
-        return max(lately_deg, self._foreseen(seen, lately_deg)) > self.options.novelty_deg
+        if lately_deg > self.options.novelty_deg:
+            return True
+        if not self._foreseen(seen, lately_deg) > self.options.novelty_deg:
+            return False
+        there_deg = self._novelty_ahead_deg(self._ahead_s())
+        return there_deg is None or there_deg > self.options.novelty_deg
 
     def _foreseen(self, values: list[tuple[float, float]], lately: float) -> float:
         """Return what a quantity will be if it goes on as it does, if it goes anywhere.
@@ -247,9 +264,12 @@ class OwnVote:
         steps = newest - between, between - oldest
         if steps[0] * steps[1] <= 0.0:
             return lately
+        return newest + min(steps, key=abs) * self._ahead_s() / third_s
+
+    def _ahead_s(self) -> float:
+        """Return how far ahead an update that is begun now has to look."""
         ahead_s = self.options.ahead_s
-        ahead_s = min(max(ahead_s, self._took_s), _FURTHEST * ahead_s)
-        return newest + min(steps, key=abs) * ahead_s / third_s
+        return min(max(ahead_s, self._took_s), _FURTHEST * ahead_s)
 
     def _is_vague(self) -> bool:
         known = [s.sigma_m for _, s in self._seen if s.sigma_m is not None]

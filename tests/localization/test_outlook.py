@@ -1,0 +1,66 @@
+"""What a map shows from a pose, by its geometry alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.localization.maps import carried_on
+from tests.localization.painted import BODIES, MOUNTING, painted_map, photograph
+from tests.scenes import PINHOLE
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import exp_so3
+from vcl_companion.localization.intra import LocalizationOptions, Localized, Prior
+from vcl_companion.localization.outlook import held_share, novelty_from
+from vcl_companion.localization.tracking import TrackingOptions, track
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.templates import prepare_templates
+from vcl_companion.mapping.uncertainty import map_uncertainty
+
+# Back, aside and turned.
+THERE = Pose(exp_so3(np.array([0.03, 0.02, -0.05])), np.array([-2.5, 0.8, -0.4]))
+AWAY = Pose(exp_so3(np.array([0.0, 0.0, np.pi])), np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def landmark_map() -> LandmarkMap:
+    return painted_map(np.random.default_rng(3))
+
+
+def test_how_new_a_map_looks_is_known_before_one_is_there(landmark_map: LandmarkMap) -> None:
+    def novelty(body: Pose) -> float | None:
+        return novelty_from(landmark_map, body @ MOUNTING, PINHOLE)
+
+    assert novelty(BODIES[0]) == pytest.approx(0.0, abs=0.01)
+    there = novelty(THERE)
+    seen = track(
+        photograph(THERE, np.random.default_rng(4)), PINHOLE, MOUNTING,
+        prepare_templates(landmark_map, map_uncertainty(landmark_map)),
+        Prior(THERE, np.diag(np.full(6, 1e-4))), None, TrackingOptions(), LocalizationOptions(),
+    )  # fmt: skip
+    assert isinstance(seen, Localized)
+    assert there is not None
+    assert seen.novelty_deg > 2.0
+    assert there == pytest.approx(seen.novelty_deg, rel=0.25)
+    assert novelty(AWAY) is None
+
+
+def test_of_all_keyframes_the_one_that_saw_it_most_alike_counts(landmark_map: LandmarkMap) -> None:
+    """A pose between the second and the third is no farther than either is."""
+    for body in BODIES[1:]:
+        novelty = novelty_from(landmark_map, body @ MOUNTING, PINHOLE)
+        assert novelty is not None
+        assert novelty < 1.0
+
+
+def test_a_pose_that_is_nonsense_tells_nothing(landmark_map: LandmarkMap) -> None:
+    for far_m in (1e6, 1e200):
+        nowhere = Pose(np.eye(3), np.full(3, far_m)) @ MOUNTING
+        assert novelty_from(landmark_map, nowhere, PINHOLE) is None
+        assert held_share(landmark_map, nowhere, PINHOLE) == 0.0
+
+
+def test_held_is_what_is_in_view_only(landmark_map: LandmarkMap) -> None:
+    some = carried_on(landmark_map, 0.4)
+    assert held_share(some, THERE @ MOUNTING, PINHOLE) == pytest.approx(0.4, abs=0.05)
+    assert held_share(some, AWAY @ MOUNTING, PINHOLE) == 0.0
