@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.checks import assert_pose_close
 from tests.daemon import demo
 from tests.daemon.swarm import Drone, Flyer, swarm
 from tests.daemon.waiting import computed, passes, passes_until, run, until
@@ -178,6 +179,43 @@ def test_who_overlapped_nobody_joins_later_with_several_frames(tmp_path: Path) -
             assert 2 <= len(mine) <= UPDATES.joiner_frames
             assert len({keyframe.captured_at_ns for keyframe in mine}) == len(mine)
             assert dict(one.exchange.refused) == {}
+
+    run(scenario())
+
+
+def test_a_view_that_its_patches_do_not_join_is_joined_by_its_features(tmp_path: Path) -> None:
+    """From where it says that it is, the map looks too different for patches.
+
+    Seen with photographs: a drone that was left out so was lost by the next one.
+    """
+
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            one, two = [
+                await members.start(system_id, flies_on=(1, 2), update=UPDATES)
+                for system_id in (1, 2)
+            ]
+            three = await members.stranger(3)
+            await three.meets(1, 2)
+            for to in (1, 2):
+                three.say(MapState(revision_of(PAIR), 1, True, FEW, True), to)
+            for drone in (one, two):
+                await drone.see(demo.frame(drone.system_id, 12))
+            at_once(one, two, tracked=FEW)
+            asked = asyncio.create_task(three.asked())
+            await passes_until(asked.done)
+            true = demo.world_from_body(3, 12)
+            aside = Pose(true.rotation, true.translation + np.array([0.0, -6.0, 0.0]))
+            answer = replace(demo.answer(3, 12, asked.result().request_id), world_from_body=aside)
+            three.hand(BlobKind.FRAME_ANSWER, encode_frame(answer), 1)
+            await computed(lambda: one.revision != revision_of(PAIR))
+            assert not keyframes_by(3, one)  # the others have theirs at once
+            for to in (1, 2):
+                three.say(MapState(one.revision, 1, True, FEW, True), to)
+            await passes_until(lambda: bool(keyframes_by(3, one)))
+            (joined,) = keyframes_by(3, one)
+            assert_pose_close(joined.world_from_body, true, within_m=0.2, within_rad=0.02)
+            assert one.events("update")[0] == "wanted by drones 1, 2, 3"
 
     run(scenario())
 

@@ -24,6 +24,8 @@ from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.daemon.peer_clocks import PeerClocks
+from vcl_companion.localization.coverage import NEAR_DEG
+from vcl_companion.localization.outlook import novelty_from
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.swarm.group import Group
@@ -236,10 +238,10 @@ class MapRounds:
         lost: tuple[int, ...],
         request_id: int,
     ) -> None:
-        """Make the next revision of what shows the map; then one of what lost drones show.
+        """Make the next revision of what shows the map; then one of what is lost or far from it.
 
-        The latter takes long, for their features are looked for all over the map: who flies
-        on has its revision before.
+        The latter takes long, for features are looked for all over the map: who flies on has
+        its revision before.
         """
         if isinstance(frames, list) and self._options.map.patches:
             built = await self._updated(stored, frames, at_once=True)
@@ -249,12 +251,8 @@ class MapRounds:
                     return
                 await self._decide(built, stored, request_id)
                 shown = {(k.drone_id, k.captured_at_ns) for k in built.keyframes}
-                frames = [
-                    f
-                    for f in frames
-                    if (f.drone_id in lost or f.world_from_body is None)
-                    and (f.drone_id, f.captured_at_ns) not in shown
-                ]
+                left_out = [f for f in frames if (f.drone_id, f.captured_at_ns) not in shown]
+                frames = [f for f in left_out if f.drone_id in lost or _is_far(f, stored)]
                 current = self._maps.current
                 if not frames or current is None:
                     return
@@ -335,6 +333,15 @@ class MapRounds:
 
     def _now_s(self) -> float:
         return asyncio.get_running_loop().time()
+
+
+def _is_far(frame: FrameAnswer, stored: StoredMap) -> bool:
+    """Whether a frame shows a map so differently that only features may join it, if at all."""
+    if frame.world_from_body is None:
+        return True
+    world_from_cam = frame.world_from_body @ frame.body_from_cam
+    novelty_deg = novelty_from(stored.index.landmark_map, world_from_cam, frame.camera)
+    return novelty_deg is None or novelty_deg > NEAR_DEG
 
 
 def _listed(drones: tuple[int, ...]) -> str:
