@@ -91,6 +91,19 @@ def test_a_map_that_it_has_not_seen_is_handed_over_and_extended(work: MapWork) -
     run(check())
 
 
+def test_an_image_takes_fewer_bytes_where_less_of_it_is_needed(work: MapWork) -> None:
+    async def check() -> None:
+        image = demo.shot(1).image
+        sizes = [
+            len(await work.encode_keyframe(image, 60_000, detail))
+            for detail in ("all", "fine", "coarse")
+        ]
+        assert sizes[0] > 1.02 * sizes[1] > 1.02 * 1.5 * sizes[2]
+        assert len(await work.encode_keyframe(image, sizes[2] // 2, "coarse")) <= sizes[2] // 2
+
+    run(check())
+
+
 def test_another_map_is_merged_into_the_one_in_use(work: MapWork) -> None:
     other = demo.encoded_map(1, 2, 3)
 

@@ -148,6 +148,7 @@ class Exchange:
         self._answers = FrameAnswers(
             system_id,
             self._frames,
+            maps,
             autopilot,
             estimator,
             sensor,

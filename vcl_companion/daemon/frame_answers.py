@@ -15,9 +15,11 @@ from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.mailbox import PeerMailbox
+from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.peer_clocks import PeerClocks
 from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.localization.detail import Detail, needed_detail
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.peer_time import Instant
 from vcl_companion.wire.frame_codec import FrameAnswer, encode_frame
@@ -63,6 +65,7 @@ class FrameAnswers:
     Args:
         system_id: this drone.
         frames: our own.
+        maps: what they may extend.
         autopilot: for the attitude that goes with a frame.
         estimator: for the pose that goes with it.
         sensor: of our camera.
@@ -80,6 +83,7 @@ class FrameAnswers:
         self,
         system_id: int,
         frames: FrameHistory,
+        maps: MapStore,
         autopilot: AutopilotLink,
         estimator: Estimator,
         sensor: Sensor,
@@ -94,6 +98,7 @@ class FrameAnswers:
     ) -> None:
         self._system_id = system_id
         self._frames = frames
+        self._maps = maps
         self._autopilot = autopilot
         self._estimator = estimator
         self._sensor = sensor
@@ -171,7 +176,7 @@ class FrameAnswers:
             at_ns, None if attitude is None else attitude.ned_from_body
         )
         image_bytes = await self._work.encode_keyframe(
-            np.asarray(frame.image), self._image_bytes, extends=state is not None
+            np.asarray(frame.image), self._image_bytes, self._detail(at_ns)
         )
         return FrameAnswer(
             drone_id=self._system_id,
@@ -184,4 +189,15 @@ class FrameAnswers:
             image_bytes=image_bytes,
             world_from_body=None if state is None else state.world_from_body,
             has_heading=has_heading,
+        )
+
+    def _detail(self, at_ns: int) -> Detail:
+        stored = self._maps.current
+        if stored is None:
+            return "all"
+        return needed_detail(
+            self._estimator.fix_at(at_ns),
+            stored.index.landmark_map,
+            self._sensor.camera,
+            self._sensor.body_from_cam,
         )

@@ -14,6 +14,7 @@ from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.worker import Worker
 from vcl_companion.daemon.workshop import NotHereError, Workshop
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.localization.detail import Detail
 from vcl_companion.localization.inter import NoProposal, Proposal
 from vcl_companion.localization.intra import Localized, NotLocalized, Prior
 from vcl_companion.localization.map_index import MapIndex
@@ -52,9 +53,9 @@ class MapWork:
         data: bytes = await self._do(_IMAGES, "encode", image, quality, most_bytes)
         return data
 
-    async def encode_keyframe(self, image: Image, most_bytes: int, *, extends: bool) -> bytes:
+    async def encode_keyframe(self, image: Image, most_bytes: int, detail: Detail) -> bytes:
         """See ``Workshop``."""
-        data: bytes = await self._do(_IMAGES, "encode_keyframe", image, most_bytes, extends)
+        data: bytes = await self._do(_IMAGES, "encode_keyframe", image, most_bytes, detail)
         return data
 
     async def signature(self, image: Image) -> bytes:

@@ -17,6 +17,7 @@ from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.peer_look import PeerLook
 from vcl_companion.daemon.usage import give_back_freed
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.localization.detail import Detail
 from vcl_companion.localization.inter import NoProposal, Proposal
 from vcl_companion.localization.intra import Localized, NotLocalized, Prior
 from vcl_companion.localization.map_index import MapIndex
@@ -109,21 +110,21 @@ class Workshop:
         """Return one of our frames as a host gets it, to say where it was; see ``encode_image``."""
         return encode_image(image, quality, most_bytes)
 
-    def encode_keyframe(self, image: Image, most_bytes: int, extends: bool) -> bytes:
+    def encode_keyframe(self, image: Image, most_bytes: int, detail: Detail) -> bytes:
         """Return one of our frames as all get it, for a map; see ``encode_image``.
 
         Args:
             image: (H, W) uint8.
             most_bytes: at most, if that can be.
-            extends: whether a map is followed in it, which it may become a keyframe of. Else
-                it has to be recognised, perhaps from far away, and all of it is of use.
+            detail: how much of it is needed.
         """
         options = self._options.map
-        if extends and options.patches:
-            strongest = FeatureOptions(max_features=options.update_features)
-            corners = detect(image, self._options.detectors[0], strongest).pixels
-            image = focused(image, corners)
-        return encode_image(image, options.keyframe_quality, most_bytes)
+        if detail == "all" or not options.patches:
+            return encode_image(image, options.keyframe_quality, most_bytes)
+        strongest = FeatureOptions(max_features=options.update_features)
+        corners = detect(image, self._options.detectors[0], strongest).pixels
+        quality = options.update_quality if detail == "coarse" else options.keyframe_quality
+        return encode_image(focused(image, corners), quality, most_bytes)
 
     def signature(self, image: Image) -> bytes:
         """Return what tells peers the place that an image shows; see ``signature_of``."""

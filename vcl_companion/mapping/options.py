@@ -15,6 +15,7 @@ class MapOptions:
         detectors: features that the map is made of; SIFT makes the better geometry
             from far apart, and those of the localization must be among them.
         keyframe_quality: WebP quality of exchanged images, 1 to 100.
+        update_quality: of those that extend a map: what they are for is found by its patches.
         update_features: images that extend a map keep their detail around so many of their
             strongest features and are blurred elsewhere (``vision.focus``).
         min_landmarks: fewer are refused.
@@ -35,6 +36,7 @@ class MapOptions:
 
     detectors: tuple[Detector, ...] = ("akaze", "sift")
     keyframe_quality: int = 80
+    update_quality: int = 40
     update_features: int = 1000
     min_landmarks: int = 60
     min_angle_deg: float = 1.0
@@ -51,8 +53,9 @@ class MapOptions:
     directory: str = ""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.keyframe_quality <= 100:
-            raise ValueError(f"keyframe_quality must lie in 1..100, got {self.keyframe_quality}")
+        for name in ("keyframe_quality", "update_quality"):
+            if not 1 <= getattr(self, name) <= 100:
+                raise ValueError(f"{name} must lie in 1..100, got {getattr(self, name)}")
         if not 100 <= self.update_features <= 20_000:
             raise ValueError(f"update_features must lie in 100..20000, got {self.update_features}")
         if self.min_landmarks < 20:
