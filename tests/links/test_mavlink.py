@@ -106,7 +106,8 @@ def test_body_rates_become_the_rate_of_the_heading() -> None:
     )
     assert isinstance(upright, AttitudeSample)
     assert upright.heading_rate_rad_s == pytest.approx(-0.5)
-    for rate in (math.nan, math.inf):
+    # All zero: a simulator without gyros.
+    for rate in (math.nan, math.inf, 0.0):
         unknown = decoded(wire.packed(wire.ATTITUDE, 7, 0.25, -0.5, 1.5, rate, 0, 0))
         assert isinstance(unknown, AttitudeSample)
         assert unknown.heading_rate_rad_s is None

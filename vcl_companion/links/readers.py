@@ -75,9 +75,13 @@ def _attitude_quaternion(m: Any, sender: _Sender) -> Message | str:
 
 
 def _heading_rate(m: Any, ned_from_body: Array) -> float | None:
-    """Return the rate about down of the body rates of either message; None where they are none."""
-    rate = float(ned_from_body[2] @ np.array([m.rollspeed, m.pitchspeed, m.yawspeed]))
-    return rate if math.isfinite(rate) else None
+    """Return the rate about down of the body rates of either message; None where they are none.
+
+    All zero is what a simulator says that has no gyros: real ones are never that still.
+    """
+    rates = np.array([m.rollspeed, m.pitchspeed, m.yawspeed])
+    rate = float(ned_from_body[2] @ rates)
+    return rate if math.isfinite(rate) and rates.any() else None
 
 
 def _ekf_status_report(m: Any, sender: _Sender) -> Message | str:
