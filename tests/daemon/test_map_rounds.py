@@ -12,7 +12,7 @@ import pytest
 
 from tests.checks import assert_pose_close
 from tests.daemon import demo
-from tests.daemon.swarm import Drone, Flyer, swarm
+from tests.daemon.swarm import Drone, Flyer, Stranger, Swarm, swarm
 from tests.daemon.waiting import computed, passes, passes_until, run, until
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import matrix_from_euler
@@ -107,20 +107,25 @@ def test_a_swarm_in_flight_gets_a_new_map_and_nobody_jumps(tmp_path: Path) -> No
     run(scenario())
 
 
+async def two_and_a_stranger(members: Swarm) -> tuple[Drone, Drone, Stranger]:
+    """All on one map, which the stranger says that it sees too little of; the others see it."""
+    one, two = [
+        await members.start(system_id, flies_on=(1, 2), update=UPDATES) for system_id in (1, 2)
+    ]
+    three = await members.stranger(3)
+    await three.meets(1, 2)
+    for to in (1, 2):
+        three.say(MapState(revision_of(PAIR), 1, True, FEW, True), to)
+    for drone in (one, two):
+        await drone.see(demo.frame(drone.system_id, 12))
+    return one, two, three
+
+
 def test_when_the_coordinator_dies_in_a_round_the_next_one_makes_it(tmp_path: Path) -> None:
     async def scenario() -> None:
         async with swarm(1, 2, 3, path=tmp_path) as members:
-            one, two = [
-                await members.start(system_id, flies_on=(1, 2), update=UPDATES)
-                for system_id in (1, 2)
-            ]
-            three = await members.stranger(3)
-            await three.meets(1, 2)
+            one, two, three = await two_and_a_stranger(members)
             old = revision_of(PAIR)
-            for to in (1, 2):
-                three.say(MapState(old, 1, True, FEW, True), to)
-            await one.see(demo.frame(1, 12))
-            await two.see(demo.frame(2, 12))
             at_once(one, two, tracked=PLENTY)
             await passes(8.0)
             assert one.events("update") == []  # one of three
@@ -191,16 +196,7 @@ def test_a_view_that_its_patches_do_not_join_is_joined_by_its_features(tmp_path:
 
     async def scenario() -> None:
         async with swarm(1, 2, 3, path=tmp_path) as members:
-            one, two = [
-                await members.start(system_id, flies_on=(1, 2), update=UPDATES)
-                for system_id in (1, 2)
-            ]
-            three = await members.stranger(3)
-            await three.meets(1, 2)
-            for to in (1, 2):
-                three.say(MapState(revision_of(PAIR), 1, True, FEW, True), to)
-            for drone in (one, two):
-                await drone.see(demo.frame(drone.system_id, 12))
+            one, two, three = await two_and_a_stranger(members)
             at_once(one, two, tracked=FEW)
             asked = asyncio.create_task(three.asked())
             await passes_until(asked.done)

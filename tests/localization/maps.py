@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -65,24 +63,3 @@ def seen_from(
     )
     seen = rng.permutation(np.flatnonzero(view.seen[:, 0]))
     return Features(view.observed_px[seen, 0], descriptors[seen])
-
-
-def carried_on(landmark_map: LandmarkMap, share: float) -> LandmarkMap:
-    """The map after a long flight: four more keyframes, and landmarks that the first did not see.
-
-    Args:
-        landmark_map: of three keyframes.
-        share: of the landmarks that are still those of the beginning.
-    """
-    later_ns = 10**9
-    newer = tuple(
-        replace(k, captured_at_ns=k.captured_at_ns + later_ns) for k in landmark_map.keyframes
-    )
-    new = np.random.default_rng(5).random(len(landmark_map.points_world)) >= share
-    then, now = landmark_map.observed_px.copy(), landmark_map.observed_px.copy()
-    then[new] = np.nan
-    return replace(
-        landmark_map,
-        keyframes=landmark_map.keyframes + newer,
-        observed_px=np.concatenate([then, now], axis=1),
-    )

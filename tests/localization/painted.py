@@ -15,8 +15,12 @@ from tests.scenes import PINHOLE
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3
+from vcl_companion.localization.intra import LocalizationOptions, Localized, Prior
+from vcl_companion.localization.tracking import TrackingOptions, track
 from vcl_companion.mapping.drone_view import encode_image
 from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
+from vcl_companion.mapping.templates import prepare_templates
+from vcl_companion.mapping.uncertainty import map_uncertainty
 from vcl_companion.recording.sensor import BODY_FROM_CAM_FORWARD
 from vcl_companion.vision.features import FeatureOptions, Image, detect
 
@@ -147,3 +151,35 @@ def painted_map(
         distances=(KnownDistance(0, 1, float(np.linalg.norm(bodies[1].translation)), 0.01),),
         parent=b"",
     )  # fmt: skip
+
+
+def carried_on(landmark_map: LandmarkMap, share: float) -> LandmarkMap:
+    """The map after a long flight: four more keyframes, and landmarks that the first did not see.
+
+    Args:
+        landmark_map: of three keyframes.
+        share: of the landmarks that are still those of the beginning.
+    """
+    later_ns = 10**9
+    newer = tuple(
+        replace(k, captured_at_ns=k.captured_at_ns + later_ns) for k in landmark_map.keyframes
+    )
+    new = np.random.default_rng(5).random(len(landmark_map.points_world)) >= share
+    then, now = landmark_map.observed_px.copy(), landmark_map.observed_px.copy()
+    then[new] = np.nan
+    return replace(
+        landmark_map,
+        keyframes=landmark_map.keyframes + newer,
+        observed_px=np.concatenate([then, now], axis=1),
+    )
+
+
+def found_in(landmark_map: LandmarkMap, body: Pose) -> Localized:
+    """What a picture of the painted world, taken there, gives by the patches of a map of it."""
+    fix = track(
+        photograph(body, np.random.default_rng(4)), PINHOLE, MOUNTING,
+        prepare_templates(landmark_map, map_uncertainty(landmark_map)),
+        Prior(body, np.diag(np.full(6, 1e-4))), None, TrackingOptions(), LocalizationOptions(),
+    )  # fmt: skip
+    assert isinstance(fix, Localized), fix.reason
+    return fix

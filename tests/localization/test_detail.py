@@ -7,17 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.localization.maps import carried_on
-from tests.localization.painted import MOUNTING, painted_map, photograph
+from tests.localization.painted import MOUNTING, carried_on, found_in, painted_map
 from tests.scenes import PINHOLE
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import exp_so3
 from vcl_companion.localization.detail import needed_detail
-from vcl_companion.localization.intra import LocalizationOptions, Localized, Prior
-from vcl_companion.localization.tracking import TrackingOptions, track
+from vcl_companion.localization.intra import Localized
 from vcl_companion.mapping.landmark_map import LandmarkMap
-from vcl_companion.mapping.templates import prepare_templates
-from vcl_companion.mapping.uncertainty import map_uncertainty
 
 NEAR = Pose(exp_so3(np.array([0.0, 0.0, -0.02])), np.array([-0.5, 0.3, -0.1]))
 
@@ -29,13 +25,7 @@ def landmark_map() -> LandmarkMap:
 
 @pytest.fixture(scope="module")
 def fix(landmark_map: LandmarkMap) -> Localized:
-    found = track(
-        photograph(NEAR, np.random.default_rng(4)), PINHOLE, MOUNTING,
-        prepare_templates(landmark_map, map_uncertainty(landmark_map)),
-        Prior(NEAR, np.diag(np.full(6, 1e-4))), None, TrackingOptions(), LocalizationOptions(),
-    )  # fmt: skip
-    assert isinstance(found, Localized)
-    return found
+    return found_in(landmark_map, NEAR)
 
 
 def test_what_is_not_recognised_is_all_of_use(landmark_map: LandmarkMap) -> None:

@@ -5,17 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.localization.maps import carried_on
-from tests.localization.painted import BODIES, MOUNTING, painted_map, photograph
+from tests.localization.painted import BODIES, MOUNTING, carried_on, found_in, painted_map
 from tests.scenes import PINHOLE
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import exp_so3
-from vcl_companion.localization.intra import LocalizationOptions, Localized, Prior
 from vcl_companion.localization.outlook import held_share, novelty_from
-from vcl_companion.localization.tracking import TrackingOptions, track
 from vcl_companion.mapping.landmark_map import LandmarkMap
-from vcl_companion.mapping.templates import prepare_templates
-from vcl_companion.mapping.uncertainty import map_uncertainty
 
 # Back, aside and turned.
 THERE = Pose(exp_so3(np.array([0.03, 0.02, -0.05])), np.array([-2.5, 0.8, -0.4]))
@@ -33,12 +28,7 @@ def test_how_new_a_map_looks_is_known_before_one_is_there(landmark_map: Landmark
 
     assert novelty(BODIES[0]) == pytest.approx(0.0, abs=0.01)
     there = novelty(THERE)
-    seen = track(
-        photograph(THERE, np.random.default_rng(4)), PINHOLE, MOUNTING,
-        prepare_templates(landmark_map, map_uncertainty(landmark_map)),
-        Prior(THERE, np.diag(np.full(6, 1e-4))), None, TrackingOptions(), LocalizationOptions(),
-    )  # fmt: skip
-    assert isinstance(seen, Localized)
+    seen = found_in(landmark_map, THERE)
     assert there is not None
     assert seen.novelty_deg > 2.0
     assert there == pytest.approx(seen.novelty_deg, rel=0.25)
