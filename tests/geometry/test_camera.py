@@ -208,3 +208,14 @@ def test_a_fisheye_shows_little_of_much_at_its_edge() -> None:
     np.testing.assert_allclose(
         slope, np.diag([200.0 * np.cos(angle) ** 2, 200.0 * angle / np.tan(angle)]), rtol=1e-4
     )
+
+
+def test_what_an_image_shows_begins_and_ends_at_its_pixels_edges() -> None:
+    right, bottom = PINHOLE.width_px - 1.0, PINHOLE.height_px - 1.0
+    corners = np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
+    outwards = np.sign(corners - corners.mean(axis=0))
+    assert PINHOLE.shows(corners + 0.49 * outwards, -0.5).all()
+    assert not PINHOLE.shows(corners + 0.51 * outwards, -0.5).any()
+    assert PINHOLE.shows(corners - 6.1 * outwards, 6.0).all()
+    assert not PINHOLE.shows(corners - outwards * [7.0, 5.9], 6.0).any()
+    assert not PINHOLE.shows(np.array([[np.nan, 5.0], [5.0, np.nan]]), -0.5).any()

@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vcl_companion.geometry.rotation import Array
 
@@ -82,6 +83,18 @@ class Camera:
         if beyond.any():
             ideal = np.where(beyond[:, None], np.nan, ideal)
         return self._distorted(ideal) * (self.fx_px, self.fy_px) + (self.cx_px, self.cy_px)
+
+    def shows(self, pixels: Array, margin_px: float) -> NDArray[np.bool_]:
+        """Return (N,) whether (N, 2) pixels lie within the image, NaN nowhere.
+
+        Args:
+            pixels: the centres of the first and the last lie at 0 and at the size less 1.
+            margin_px: by how much more than on these; -0.5 is all of the image.
+        """
+        size = np.array([self.width_px, self.height_px])
+        with np.errstate(invalid="ignore"):
+            inside = (pixels > margin_px) & (pixels < size - 1 - margin_px)
+        return np.asarray(inside.all(axis=1))
 
     def pixel_slopes(self, ideal: Array) -> Array:
         """Return (N, 2, 2) d(pixel) / d(ideal) at (N, 2) ideal image coordinates, px.

@@ -261,20 +261,23 @@ def _heading_change(before: AttitudeSample, after: AttitudeSample) -> float:
     return float(log_so3(after.ned_from_body @ before.ned_from_body.T)[2])
 
 
+def _felt(*samples: AttitudeSample) -> list[float]:
+    """Return what the gyros say of the heading at those of some samples that tell, rad/s."""
+    return [s.heading_rate_rad_s for s in samples if s.heading_rate_rad_s is not None]
+
+
 def _rate_felt(since_s: float, *samples: AttitudeSample) -> tuple[float, float] | None:
     """Return the mean of what the gyros say at samples so far apart, and that time.
 
-    None where one does not say, or there is no time between them.
+    None where one does not say.
     """
-    rates = [s.heading_rate_rad_s for s in samples if s.heading_rate_rad_s is not None]
-    if len(rates) < len(samples) or since_s <= 0.0:
-        return None
-    return sum(rates) / len(rates), since_s
+    rates = _felt(*samples)
+    return (sum(rates) / len(rates), since_s) if len(rates) == len(samples) else None
 
 
 def _is_felt(change_rad: float, since_s: float, *samples: AttitudeSample) -> bool:
     """Whether a change of heading lies between what the gyros say at these samples."""
-    known = [s.heading_rate_rad_s for s in samples if s.heading_rate_rad_s is not None]
+    known = _felt(*samples)
     if not known:
         return False
     least, most = min(known) * since_s, max(known) * since_s

@@ -33,7 +33,8 @@ def novelty_from(landmark_map: LandmarkMap, world_from_cam: Pose, camera: Camera
     if len(shown) < _LEAST_LANDMARKS:
         return None
     some = shown[:: -(-len(shown) // _N_LANDMARKS)]
-    points, seen = landmark_map.points_world[some], landmark_map.seen[some]
+    points = landmark_map.points_world[some]
+    seen = np.isfinite(landmark_map.observed_px[some, :, 0])  # asked often: of these few only
     newness = np.full(seen.shape, np.inf)
     for i, keyframe in enumerate(landmark_map.keyframes):
         then = (keyframe.world_from_body @ keyframe.body_from_cam).translation
@@ -64,6 +65,4 @@ def _in_view(landmark_map: LandmarkMap, world_from_cam: Pose, camera: Camera) ->
     # A peer's pose and camera are bounded, and may be nonsense.
     with np.errstate(all="ignore"):
         pixels = camera.project(world_from_cam.inverse().apply(landmark_map.points_world))
-        size = np.array([camera.width_px, camera.height_px])
-        inside = ((pixels > -0.5) & (pixels < size - 0.5)).all(axis=1)
-    return np.flatnonzero(inside)
+    return np.flatnonzero(camera.shows(pixels, -0.5))

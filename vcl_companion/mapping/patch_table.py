@@ -161,8 +161,7 @@ class PatchTable:
             camera, pixels = self._cameras[i], reference.pixels[rows]
             z = worlds_from_cams[i].inverse().apply(reference.points[rows])[:, 2]
             ideal = camera.ideal_from_pixels(pixels)
-            size = np.array([camera.width_px, camera.height_px])
-            inside = ((pixels > _MARGIN_PX) & (pixels < size - 1 - _MARGIN_PX)).all(axis=1)
+            inside = camera.shows(pixels, _MARGIN_PX)
             ok = inside & (z > 0.05) & np.isfinite(ideal).all(axis=1) & np.isfinite(z)
             if self._pyramids[i] is None or not ok.any():
                 continue

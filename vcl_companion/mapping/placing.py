@@ -71,9 +71,7 @@ def references(
         n_wanted: at most so many, evenly of all there are.
     """
     pixels = camera.project(world_from_cam.inverse().apply(known.points_world))
-    size = np.array([camera.width_px, camera.height_px])
-    with np.errstate(invalid="ignore"):
-        inside = np.flatnonzero(((pixels > 6.0) & (pixels < size - 7.0)).all(axis=1))
+    inside = np.flatnonzero(camera.shows(pixels, 6.0))
     points = known.points_world[inside]
     ray = points - world_from_cam.translation
     distance = np.maximum(np.linalg.norm(ray, axis=1), 1e-9)
