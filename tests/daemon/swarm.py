@@ -151,8 +151,11 @@ class Drone:
         """Have a frame been looked at on the map in use, as a companion would say."""
         self.estimator.seen_on = self.revision
 
-    def track(self, n_landmarks: int) -> None:
-        """Have the drone look at a frame with so many landmarks in it, without one at 0."""
+    def track(self, n_landmarks: int, at: Pose | None = None) -> None:
+        """Have the drone look at a frame with so many landmarks in it, without one at 0.
+
+        Where it was is by their patches then, if it is given, else nobody would want to know.
+        """
         at_ns = self.clock.now_ns()
         self._looked()
         predicted = self.estimator.predicted(at_ns, None)
@@ -160,9 +163,9 @@ class Drone:
             self.estimator.take_nothing(predicted, at_ns, None)
             return
         fix = Localized(
-            Pose.identity(), 1e-4 * np.eye(6), 1e-4 * np.eye(6), np.zeros((6, 0)),
+            at or Pose.identity(), 1e-4 * np.eye(6), 1e-4 * np.eye(6), np.zeros((6, 0)),
             np.zeros((0, 0)), n_landmarks, n_landmarks, False, 0.5,
-            n_seen=n_landmarks, covered=1.0,
+            n_seen=n_landmarks, covered=1.0, by="patches" if at else "features",
         )  # fmt: skip
         self.estimator.take_fix(predicted, fix, at_ns, None)
 

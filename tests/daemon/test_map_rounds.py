@@ -34,11 +34,16 @@ def at_once(*drones: Drone, tracked: int) -> None:
         drone.track(tracked)
 
 
-def keyframes_by(system_id: int, drone: Drone) -> list[Keyframe]:
-    """Those that one drone took, of the map that another flies on."""
+def keyframes_of(drone: Drone) -> tuple[Keyframe, ...]:
+    """Those of the map that a drone flies on."""
     stored = drone.maps.current
     assert stored is not None
-    return [k for k in stored.index.landmark_map.keyframes if k.drone_id == system_id]
+    return stored.index.landmark_map.keyframes
+
+
+def keyframes_by(system_id: int, drone: Drone) -> list[Keyframe]:
+    """Those that one drone took, of the map that another flies on."""
+    return [k for k in keyframes_of(drone) if k.drone_id == system_id]
 
 
 async def poses_of(drone: Flyer) -> list[tuple[int, Pose, float]]:
@@ -103,6 +108,34 @@ def test_a_swarm_in_flight_gets_a_new_map_and_nobody_jumps(tmp_path: Path) -> No
             assert seen is not None
             assert {keyframe.drone_id for keyframe in seen.keyframes[3:]} <= {1, 2, 3}
             assert len(seen.keyframes) > 3
+
+    run(scenario())
+
+
+@pytest.mark.parametrize("third_looks_elsewhere", [False, True])
+def test_of_views_that_are_alike_two_extend_the_map(
+    tmp_path: Path, third_looks_elsewhere: bool
+) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            drones = [
+                await members.start(system_id, flies_on=(1, 2, 3), update=UPDATES)
+                for system_id in (1, 2, 3)
+            ]
+            one, two, three = drones
+            for drone in drones:
+                await drone.see(demo.frame(drone.system_id, 12))
+                drone.track(PLENTY, demo.world_from_body(drone.system_id, 12))
+            await passes(1.0)
+            for drone in (one, two):
+                drone.track(FEW * 9, demo.world_from_body(drone.system_id, 12))
+            few = FEW * (4 if third_looks_elsewhere else 9)
+            three.track(few, demo.world_from_body(3, 12))
+            await computed(lambda: revision_of(TRIO) not in {drone.revision for drone in drones})
+            came = [1, 2, 3] if third_looks_elsewhere else [1, 2]
+            assert [keyframe.drone_id for keyframe in keyframes_of(three)[3:]] == came
+            assert [len(drone.requests) for drone in drones] == [0, 1, came.count(3)]
+            assert one.events("vote") == ["the map is to be updated: few landmarks"]
 
     run(scenario())
 

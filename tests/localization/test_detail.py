@@ -35,11 +35,13 @@ def test_what_is_not_recognised_is_all_of_use(landmark_map: LandmarkMap) -> None
 def test_near_by_and_while_the_first_views_are_in_sight_it_may_be_coarse(
     landmark_map: LandmarkMap, fix: Localized
 ) -> None:
-    for seen in (landmark_map, carried_on(landmark_map, 0.7)):
+    for one in (fix, replace(fix, novelty_deg=9.5)):
+        assert needed_detail(one, landmark_map, PINHOLE, MOUNTING) == "coarse"
+    for seen in (landmark_map, carried_on(landmark_map, 0.6)):
         assert needed_detail(fix, seen, PINHOLE, MOUNTING) == "coarse"
-    assert needed_detail(fix, carried_on(landmark_map, 0.5), PINHOLE, MOUNTING) == "fine"
+    assert needed_detail(fix, carried_on(landmark_map, 0.4), PINHOLE, MOUNTING) == "fine"
 
 
 def test_from_far_apart_it_may_not(landmark_map: LandmarkMap, fix: Localized) -> None:
-    for one in (replace(fix, novelty_deg=8.0), replace(fix, by="features", novelty_deg=0.0)):
+    for one in (replace(fix, novelty_deg=10.5), replace(fix, by="features", novelty_deg=0.0)):
         assert needed_detail(one, landmark_map, PINHOLE, MOUNTING) == "fine"

@@ -41,6 +41,12 @@ def test_who_has_lost_half_of_what_it_saw_votes() -> None:
     assert not voted([share - 1] * 30)  # it never saw more of this one
 
 
+def test_of_more_than_enough_the_loss_is_none() -> None:
+    many = 5 * OPTIONS.enough
+    assert not voted([many] * 30 + [round(OPTIONS.share * OPTIONS.enough)] * 30)
+    assert voted([many] * 30 + [round(OPTIONS.share * OPTIONS.enough) - 1] * 30)
+
+
 def test_one_bad_frame_changes_nothing() -> None:
     assert not voted([PLENTY] * 20 + [0, 0])
     assert voted([FEW] * 20 + [PLENTY, PLENTY])
@@ -92,11 +98,12 @@ def test_what_fills_less_and_less_and_what_looks_ever_newer_is_foreseen() -> Non
     still = [Sight(PLENTY, 0.95, 0.001, 1.0)] * 20
     assert not seen(still)
     assert seen(still + [Sight(PLENTY, 0.95 - 0.02 * k, 0.001, 1.0) for k in range(12)])
-    assert seen(still + [Sight(PLENTY, 0.95, 0.001, 1.0 + 0.2 * k) for k in range(12)])
+    assert seen(still + [Sight(PLENTY, 0.95, 0.001, 1.0 + 0.3 * k) for k in range(12)])
+    assert not seen(still + [Sight(PLENTY, 0.95, 0.001, 1.0 + 0.18 * k) for k in range(12)])
     assert not seen(still + [Sight(PLENTY, 0.95 - 0.002 * k, 0.001, 1.0) for k in range(12)])
 
 
-@pytest.mark.parametrize(("there_deg", "votes"), [(4.0, False), (6.0, True), (None, True)])
+@pytest.mark.parametrize(("there_deg", "votes"), [(7.5, False), (8.5, True), (None, True)])
 def test_what_looks_ever_newer_is_no_news_on_the_way_to_a_place_that_the_map_knows(
     there_deg: float | None, votes: bool
 ) -> None:
@@ -107,7 +114,7 @@ def test_what_looks_ever_newer_is_no_news_on_the_way_to_a_place_that_the_map_kno
         return there_deg
 
     vote = OwnVote(OPTIONS, ahead)
-    newer = [1.0] * 20 + [1.0 + 0.2 * k for k in range(12)]
+    newer = [1.0] * 20 + [1.0 + 0.3 * k for k in range(12)]
     seen = [Sight(PLENTY, 0.95, 0.001, novelty) for novelty in newer]
     assert [vote.look(FIRST, sight, k * STEP_S) for k, sight in enumerate(seen)][-1] is votes
     assert set(asked) == {OPTIONS.ahead_s}
@@ -135,6 +142,7 @@ def test_without_a_map_or_with_updates_turned_off_nobody_votes() -> None:
     ("name", "value"),
     [
         ("tracked", -1),
+        ("enough", 0),
         ("share", 1.0),
         ("share", -0.1),
         ("hold_s", 0.0),
@@ -418,6 +426,20 @@ def test_who_sees_the_map_in_a_corner_of_the_image_only_votes() -> None:
     assert judged([wide] * 20 + [narrow] * 20)
     assert not judged([wide] * 40)
     assert not judged([narrow] * 40)  # the sky never covers more
+
+
+def test_a_corner_with_many_landmarks_does_as_much_as_all_of_the_image_with_few() -> None:
+    def votes(tracked: int, covered: float) -> bool:
+        vote = OwnVote(OPTIONS)
+        seen = [Sight(tracked, 1.0)] * 20 + [Sight(tracked, covered)] * 30
+        return [vote.look(FIRST, sight, k * STEP_S) for k, sight in enumerate(seen)][-1]
+
+    half = 0.5 * OPTIONS.covered
+    assert votes(OPTIONS.enough, OPTIONS.covered - 0.01)
+    assert not votes(OPTIONS.enough, OPTIONS.covered)
+    assert votes(OPTIONS.tracked, OPTIONS.covered - 0.01)  # of fewer no more is asked for
+    assert votes(4 * OPTIONS.enough, half - 0.01)
+    assert not votes(4 * OPTIONS.enough, half)
 
 
 def test_who_knows_its_place_twice_worse_than_at_best_votes() -> None:

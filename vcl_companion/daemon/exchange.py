@@ -166,6 +166,7 @@ class Exchange:
             self._frames,
             maps,
             self._answers.describe,
+            self._answers.detail,
             self._send,
             self.decide,
             self._passed,

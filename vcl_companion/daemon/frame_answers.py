@@ -169,14 +169,13 @@ class FrameAnswers:
         """
         at_ns = frame.captured_at_ns
         attitude = await self._autopilot.attitudes.at(at_ns, ATTITUDE_WAIT_S)
-        if self._estimator.is_localized(self._clock.now_ns()):
-            await self._estimator.looked_at(at_ns, _SETTLE_S)
+        detail = await self.detail(frame)
         state = self._estimator.own_fix_at(at_ns)
         ned_from_body, has_heading = self._estimator.for_peers(
             at_ns, None if attitude is None else attitude.ned_from_body
         )
         image_bytes = await self._work.encode_keyframe(
-            np.asarray(frame.image), self._image_bytes, self._detail(at_ns)
+            np.asarray(frame.image), self._image_bytes, detail
         )
         return FrameAnswer(
             drone_id=self._system_id,
@@ -191,7 +190,11 @@ class FrameAnswers:
             has_heading=has_heading,
         )
 
-    def _detail(self, at_ns: int) -> Detail:
+    async def detail(self, frame: Frame) -> Detail:
+        """Return how much of one of our frames the map in use is extended by."""
+        at_ns = frame.captured_at_ns
+        if self._estimator.is_localized(self._clock.now_ns()):
+            await self._estimator.looked_at(at_ns, _SETTLE_S)
         stored = self._maps.current
         if stored is None:
             return "all"

@@ -25,7 +25,9 @@ from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.daemon.peer_clocks import PeerClocks
 from vcl_companion.localization.coverage import NEAR_DEG
+from vcl_companion.localization.detail import Detail
 from vcl_companion.localization.outlook import novelty_from
+from vcl_companion.mapping.contributing import without_alike
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.swarm.group import Group
@@ -41,6 +43,10 @@ _LOOK_S = 0.1
 # A camera that delivers nothing new has nothing for a map either.
 _STALE_NS = 60 * 1_000_000_000
 
+# Who has less than this share of our landmarks in sight looks elsewhere by now.
+_LEAST_SEEN = 0.5
+# Whoever has been heard by us is heard by all a moment later, and is sent what all are sent.
+_ACQUAINTED_S = 0.5
 # Nobody needs longer than so many times the patience to hand over a map, whatever trickles in.
 _MAX_DELIVERIES = 10.0
 
@@ -69,6 +75,7 @@ class MapRounds:
         frames: our own.
         maps: where the result goes, by ``decide``.
         describe: makes the answer that a peer would give of one of our frames.
+        detail: says how much of one of our frames the map is extended by.
         ask: sends a request to a peer.
         decide: takes what became of a round.
         passed: sends the frames of an update on while it is built.
@@ -88,6 +95,7 @@ class MapRounds:
         frames: FrameHistory,
         maps: MapStore,
         describe: Callable[[Frame, int], Awaitable[FrameAnswer]],
+        detail: Callable[[Frame], Awaitable[Detail]],
         ask: Callable[[FrameRequest, int], None],
         decide: Decide,
         passed: PassedFrames,
@@ -104,6 +112,7 @@ class MapRounds:
         self._frames = frames
         self._maps = maps
         self._describe = describe
+        self._detail = detail
         self._decide = decide
         self._passed = passed
         self._is_updating = False
@@ -116,6 +125,7 @@ class MapRounds:
         self._gathering = Gathering(group, ask, clock, clocks, rng)
         self._trigger = UpdateTrigger(options.update, group)
         self._claimed_since_s: float | None = None
+        self._complete_since_s: float | None = None
         self.is_asked = False
         """Whether the ground wants an update: whoever coordinates makes it at once."""
         self.progress = 255
@@ -165,7 +175,12 @@ class MapRounds:
             return True
         # Who is heard but has not said yet what it flies on may well have a map.
         told = all(self._group.state_of(peer) is not None for peer in self._group.peers)
-        return self._group.is_complete and told
+        if not (self._group.is_complete and told):
+            self._complete_since_s = None
+            return False
+        if self._complete_since_s is None:
+            self._complete_since_s = self._now_s()
+        return self._now_s() >= self._complete_since_s + _ACQUAINTED_S
 
     def _has_map(self) -> bool:
         """Whether there is a map: ours, or of a peer, which will send it (we are late, or back).
@@ -209,9 +224,7 @@ class MapRounds:
         _log.info("the map is updated, %s", reason)
 
         request_id = self._gathering.begin()
-        contributors = self._group.contributors(
-            (*lost, *self._group.wanting_update), update.contributors
-        )
+        contributors = await self._contributors(stored, frame, lost)
         earlier = dict.fromkeys(lost, update.joiner_frames - 1)
         n_frames = len(contributors) - 1 + sum(earlier.values())
         wanted = Wanted(
@@ -230,6 +243,28 @@ class MapRounds:
             self._is_updating = False
         self.progress = _BUILDING
         await self._extend(stored, frames, lost, request_id)
+
+    async def _contributors(
+        self, stored: StoredMap, frame: Frame, lost: tuple[int, ...]
+    ) -> tuple[int, ...]:
+        """Return whose frames an update is made of.
+
+        All views count where frame and scale are carried on. Where a coarse image of ours does,
+        they are held by what is known, and of views that are alike two suffice.
+        """
+        group, most = self._group, self._options.update.contributors
+        members = group.contributors((*lost, *group.wanting_update), len(group.members))
+        if len(members) > 2 and await self._detail(frame) == "coarse":
+            blind = [m for m in members if not self._sees_enough(m)]
+            members = without_alike(members, stored.index.landmark_map, (*lost, *blind))
+        return members[:most]
+
+    def _sees_enough(self, member: int) -> bool:
+        """Whether a member still sees the map about as well as we do."""
+        state, own = self._group.state_of(member), self._group.state_of(self._group.own_id)
+        if state is None or own is None or not state.localized:
+            return False
+        return state.tracked >= _LEAST_SEEN * own.tracked
 
     async def _extend(
         self,

@@ -33,7 +33,7 @@ class OwnState:
         estimator: where we are, and what we see of the map.
         sensor: of our camera.
         clock: time base of frames.
-        log: told of teams.
+        log: told of teams, and why we vote for an update.
         options: when the map is to be updated.
         send: sends a message to a peer, or to all (0).
     """
@@ -120,6 +120,8 @@ class OwnState:
             Sight(seen.tracked, seen.covered, sigma_m, seen.novelty_deg),
             now_s,
         )
+        if self._wants_update and not before:
+            self._log.event("vote", f"the map is to be updated: {', '.join(self._vote.reasons)}")
         self._wants_update |= self.is_asked_for_update and stored is not None
         return self._wants_update != before
 

@@ -8,8 +8,7 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.rotation import Array
 
 NEAR_DEG = 7.0
-"""A view no newer than this is joined with a map by its patches alone: more than what a flight has
-come when it wants the map extended. Photographs metres apart are farther."""
+"""A view no newer than this is surely joined with a map by its patches alone."""
 
 _COLUMNS, _ROWS = 8, 6
 # A patch bears a turn of so many degrees as well as being seen twice as large or small.

@@ -6,7 +6,6 @@ from typing import Literal
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.localization.coverage import NEAR_DEG
 from vcl_companion.localization.intra import Localized
 from vcl_companion.localization.outlook import held_share
 from vcl_companion.mapping.landmark_map import LandmarkMap
@@ -14,8 +13,11 @@ from vcl_companion.mapping.landmark_map import LandmarkMap
 Detail = Literal["all", "fine", "coarse"]
 """All of an image, to be recognised by; what is around its corners; the same, but coarsely."""
 
+# A view no newer than this shows the map from near by: a flight has its map extended for views
+# that will be 8 degrees new, and is a little farther then. Photographs metres apart are farther.
+_COARSE_DEG = 10.0
 # So many of the landmarks in view are the oldest keyframes' too where an image may be coarse.
-_HELD_SHARE = 0.6
+_HELD_SHARE = 0.5
 
 
 def needed_detail(
@@ -34,7 +36,7 @@ def needed_detail(
     """
     if fix is None:
         return "all"
-    if fix.by != "patches" or fix.novelty_deg > NEAR_DEG:
+    if fix.by != "patches" or fix.novelty_deg > _COARSE_DEG:
         return "fine"
     held = held_share(landmark_map, fix.world_from_body @ body_from_cam, camera)
     return "coarse" if held >= _HELD_SHARE else "fine"

@@ -36,7 +36,7 @@ class MapOptions:
 
     detectors: tuple[Detector, ...] = ("akaze", "sift")
     keyframe_quality: int = 80
-    update_quality: int = 40
+    update_quality: int = 36
     update_features: int = 1000
     min_landmarks: int = 60
     min_angle_deg: float = 1.0

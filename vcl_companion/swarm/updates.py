@@ -5,12 +5,15 @@ update when one of these holds for the median of its last second, or, of the
 first three, will hold ``ahead_s`` from now if the second goes on as it went (or
 as long from now as the last update took, from the vote to the map):
 
-* landmarks in sight < max(``tracked``, ``share`` x most since this revision);
-* covered share of the image < min(``covered``, 0.8 x most since this revision):
-  sky is never covered, and no reason to update again and again;
+* landmarks in sight < max(``tracked``, ``share`` x most since this revision, of which no more
+  than ``enough`` count: a pose is found by a few hundred, and is hardly better by more);
+* covered share of the image < min(``covered``, 0.8 x most since this revision), the former
+  less by the root of how many times ``enough`` landmarks are in sight: these make up for it.
+  Sky is never covered, and no reason to update again and again;
 * median novelty of what is seen > ``novelty_deg``: from a new place the map is still
-  recognised, and soon no more, and here it can be joined to what comes; foreseen only where
-  the map, asked about the place that the drone is on its way to, does not know that either;
+  recognised, and soon no more, and here it can be joined to what comes; foreseen where it will be
+  more than 1.6 times that, and only where the map, asked about the place that the drone is on its
+  way to, does not know that either;
 * 1-sigma of the position > max(``sigma_m``, ``sigma_growth`` x least since this
   revision): what is known no better than that only gets worse, and is
   inherited by whatever is added to the map later.
@@ -35,6 +38,9 @@ _WINDOW_S = 1.0
 # than nearly all of it.
 _JUDGED_SHARE = 0.5
 _FORESEEN_SHARE = 0.85
+# A flight comes step by step to where a view will be so many times as new as one that is here
+# already: of photographs metres apart the next one may be lost.
+_NEWER_AHEAD = 1.6
 # A view that is never covered more, by sky perhaps, is no reason to update.
 _STILL_COVERED = 0.8
 # An update that did not help is followed by a longer pause, up to so many intervals.
@@ -56,9 +62,12 @@ class UpdateOptions:
         tracked: a drone that sees fewer landmarks of the map wants it updated.
         share: so does one that sees less than this share of the most that it
             has seen of this revision; 0 for both of them: maps stay as they are.
-        covered: share of the image that the map has to fill.
+        enough: of the most that was seen no more are counted: what is lost of more is no loss.
+        covered: share of the image that the map has to fill with ``enough`` landmarks or fewer;
+            with four times as many, half of that.
         novelty_deg: landmarks are seen from so far aside of where they are remembered, or as
-            much nearer or farther (``localization.coverage``), before the map is extended.
+            much nearer or farther (``localization.coverage``), before the map is extended;
+            1.6 times that where it is only foreseen.
         ahead_s: a map is judged by what will be seen of it when an update, begun now, is there;
             where the last one took longer, by so much, up to twice as long.
         sigma_m: positions better than this are good enough.
@@ -86,6 +95,7 @@ class UpdateOptions:
     # Beside its own keyframe a map is seen half as well again as from anywhere else, so this
     # is little less than what is usual: it has to be early, for the same reason.
     share: float = 0.6
+    enough: int = 600
     covered: float = 0.7
     novelty_deg: float = 5.0
     ahead_s: float = 2.0
@@ -104,6 +114,8 @@ class UpdateOptions:
     def __post_init__(self) -> None:
         if self.tracked < 0:
             raise ValueError(f"tracked must not be negative, got {self.tracked}")
+        if self.enough < 1:
+            raise ValueError(f"enough must be positive, got {self.enough}")
         if not 0 <= self.share < 1:
             raise ValueError(f"share must lie in [0, 1), got {self.share}")
         if not 0 <= self.covered < 1:
@@ -158,6 +170,7 @@ class OwnVote:
 
     Attributes:
         options: what it goes by; may be changed.
+        reasons: why it wants one, each in some words; none while it does not.
     """
 
     def __init__(
@@ -173,7 +186,7 @@ class OwnVote:
         self._most = 0.0
         self._most_covered = 0.0
         self._least_sigma_m = math.inf
-        self._wants = False
+        self.reasons: tuple[str, ...] = ()
         self._wanted_since_s: float | None = None
         self._took_s = 0.0
 
@@ -202,20 +215,24 @@ class OwnVote:
         while self._seen[0][0] < now_s - _WINDOW_S:
             self._seen.popleft()
         if not revision or not (self.options.tracked or self.options.share):
-            self._wants = False
+            self.reasons = ()
         elif now_s - self._since_s >= _JUDGED_SHARE * _WINDOW_S:
-            self._wants = (
-                self._is_little() or self._is_narrow() or self._is_vague() or self._is_new()
-            )
-        if not self._wants:
+            judged = {
+                "few landmarks": self._is_little(),
+                "little of the image": self._is_narrow(),
+                "vague position": self._is_vague(),
+                "new view": self._is_new(),
+            }
+            self.reasons = tuple(reason for reason, holds in judged.items() if holds)
+        if not self.reasons:
             self._wanted_since_s = None
         elif self._wanted_since_s is None:
             self._wanted_since_s = now_s
-        return self._wants
+        return bool(self.reasons)
 
     def unseen(self) -> bool:
         """Vote while no frame has been looked at on the map in use: nobody knows what it lacks."""
-        self._wants, self._wanted_since_s = False, None
+        self.reasons, self._wanted_since_s = (), None
         return False
 
     def _is_little(self) -> bool:
@@ -223,7 +240,8 @@ class OwnVote:
         seen = [(at_s, float(s.tracked)) for at_s, s in self._seen]
         lately = statistics.median_high(n for _, n in seen)
         self._most = max(self._most, lately)
-        least = max(self.options.tracked, self.options.share * self._most)
+        counted = min(self._most, self.options.enough)
+        least = max(self.options.tracked, self.options.share * counted)
         return min(lately, self._foreseen(seen, lately)) < least
 
     def _is_narrow(self) -> bool:
@@ -232,7 +250,10 @@ class OwnVote:
             return False
         lately = statistics.median_high(share for _, share in known)
         self._most_covered = max(self._most_covered, lately)
-        least = min(self.options.covered, _STILL_COVERED * self._most_covered)
+        tracked = statistics.median_low(sight.tracked for _, sight in self._seen)
+        # A pose is as sure as landmarks are far apart, and by the root of how many they are.
+        needed = self.options.covered * math.sqrt(min(self.options.enough / max(tracked, 1), 1.0))
+        least = min(needed, _STILL_COVERED * self._most_covered)
         return min(lately, self._foreseen(known, lately)) < least
 
     def _is_new(self) -> bool:
@@ -240,10 +261,11 @@ class OwnVote:
         lately_deg = statistics.median_low(novelty for _, novelty in seen)
         if lately_deg > self.options.novelty_deg:
             return True
-        if not self._foreseen(seen, lately_deg) > self.options.novelty_deg:
+        foreseen_deg = _NEWER_AHEAD * self.options.novelty_deg
+        if not self._foreseen(seen, lately_deg) > foreseen_deg:
             return False
         there_deg = self._novelty_ahead_deg(self._ahead_s())
-        return there_deg is None or there_deg > self.options.novelty_deg
+        return there_deg is None or there_deg > foreseen_deg
 
     def _foreseen(self, values: list[tuple[float, float]], lately: float) -> float:
         """Return what a quantity will be if it goes on as it does, if it goes anywhere.
