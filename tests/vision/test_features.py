@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -59,6 +60,30 @@ def test_the_same_image_gives_the_same_features(detector: Detector) -> None:
     assert len(one) > 50
     np.testing.assert_array_equal(one.pixels, two.pixels)
     np.testing.assert_array_equal(one.descriptors, two.descriptors)
+
+
+@pytest.mark.parametrize("size_px", [(640, 480), (700, 250), (330, 1000)])
+def test_tiles_of_an_image_show_what_the_whole_image_does(size_px: tuple[int, int]) -> None:
+    rng = np.random.default_rng(13)
+    coarse, fine = (rng.normal(0.0, 60.0, (size_px[1], size_px[0])) for _ in range(2))
+    grey = 12.0 * cv2.GaussianBlur(coarse, None, 8.0) + 3.0 * cv2.GaussianBlur(fine, None, 1.5)
+    image = np.clip(120.0 + grey, 0, 255).astype(np.uint8)
+    every = FeatureOptions(max_features=20_000)
+    tiled = detect(image, "sift", every)
+    engine = cv2.SIFT.create(contrastThreshold=every.sift_contrast, enable_precise_upscale=True)
+    keypoints, descriptors = engine.detectAndCompute(image, None)
+    pixels = np.array([keypoint.pt for keypoint in keypoints])
+    assert len(pixels) > 500
+    assert len(tiled) == pytest.approx(len(pixels), rel=0.01)
+    alike = np.sqrt(descriptors / descriptors.sum(axis=1, keepdims=True))
+    is_there = [
+        np.any(
+            (np.linalg.norm(tiled.pixels - pixel, axis=1) < 0.05)
+            & (np.linalg.norm(tiled.descriptors - descriptor, axis=1) < 0.1)
+        )
+        for pixel, descriptor in zip(pixels, alike, strict=True)
+    ]
+    assert np.mean(is_there) > 0.98
 
 
 @every_detector

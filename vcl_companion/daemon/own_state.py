@@ -111,12 +111,14 @@ class OwnState:
         stored = self._maps.current
         before = self._wants_update
         seen = self._estimator
+        revision = stored.revision if stored else b""
+        self._vote.follow(revision, self._group.majority_wants_update, now_s)
         if stored is not None and seen.seen_on != stored.revision:
             self._wants_update = self._vote.unseen()
             return self._wants_update != before
         sigma_m = seen.sigma_m if seen.tracked else None
         self._wants_update = self._vote.look(
-            stored.revision if stored else b"",
+            revision,
             Sight(seen.tracked, seen.covered, sigma_m, seen.novelty_deg),
             now_s,
         )

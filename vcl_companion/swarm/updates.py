@@ -3,7 +3,7 @@
 No clock and no socket: the owner says what time it is. A drone votes for an
 update when one of these holds for the median of its last second, or, of the
 first three, will hold ``ahead_s`` from now if the second goes on as it went (or
-as long from now as the last update took, from the vote to the map):
+as long from now as the last update took, from the majority's wish to the map):
 
 * landmarks in sight < max(``tracked``, ``share`` x most since this revision, of which no more
   than ``enough`` count: a pose is found by a few hundred, and is hardly better by more);
@@ -187,8 +187,27 @@ class OwnVote:
         self._most_covered = 0.0
         self._least_sigma_m = math.inf
         self.reasons: tuple[str, ...] = ()
+        self._used = b""
         self._wanted_since_s: float | None = None
         self._took_s = 0.0
+
+    def follow(self, revision: bytes, is_wanted: bool, now_s: float) -> None:
+        """Take note of how long updates take; call it before each ``look`` and ``unseen``.
+
+        Args:
+            revision: of the map in use; empty for none.
+            is_wanted: whether the majority wants it updated. From that on, not from our own vote:
+                one that is alone waits for the others, and would look ahead the further for it.
+            now_s: not before the last call's.
+        """
+        if revision != self._used:
+            if self._wanted_since_s is not None:
+                self._took_s = now_s - self._wanted_since_s
+            self._used, self._wanted_since_s = revision, None
+        elif not is_wanted:
+            self._wanted_since_s = None
+        elif self._wanted_since_s is None:
+            self._wanted_since_s = now_s
 
     def look(self, revision: bytes, sight: Sight, now_s: float) -> bool:
         """Take in what is seen now; call it several times a second.
@@ -204,8 +223,6 @@ class OwnVote:
             what was wanted may not have come of it.
         """
         if revision != self._revision:
-            if self._wanted_since_s is not None:
-                self._took_s, self._wanted_since_s = now_s - self._wanted_since_s, None
             self._revision = revision
             self._seen.clear()
             self._since_s = now_s
@@ -221,18 +238,16 @@ class OwnVote:
                 "few landmarks": self._is_little(),
                 "little of the image": self._is_narrow(),
                 "vague position": self._is_vague(),
-                "new view": self._is_new(),
             }
             self.reasons = tuple(reason for reason, holds in judged.items() if holds)
-        if not self.reasons:
-            self._wanted_since_s = None
-        elif self._wanted_since_s is None:
-            self._wanted_since_s = now_s
+            # May look all over the map: not asked where there is a reason already.
+            if not self.reasons and self._is_new():
+                self.reasons = ("new view",)
         return bool(self.reasons)
 
     def unseen(self) -> bool:
         """Vote while no frame has been looked at on the map in use: nobody knows what it lacks."""
-        self.reasons, self._wanted_since_s = (), None
+        self.reasons = ()
         return False
 
     def _is_little(self) -> bool:

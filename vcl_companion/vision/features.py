@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,8 +20,12 @@ Image = NDArray[np.uint8]
 # OpenCV's AKAZE corrupts memory on an image one pixel high, and images come from peers.
 _MIN_SIDE_PX = 32
 
-# For a moment AKAZE takes 30 MB for an image of 640 x 480, SIFT 70: one thread after the other.
+# For a moment AKAZE takes 30 MB for an image of 640 x 480: one thread after the other.
 _one_at_a_time = threading.Lock()
+# SIFT takes 200 bytes a pixel, so it looks at tiles: at most so large, at a multiple of what its
+# coarser octaves leave out, and so far beyond their borders as all but one in a hundred features
+# reach (these are found there as in the whole image; the others a little displaced).
+_TILE_PX, _TILES_STAND_AT_PX, _BEYOND_TILE_PX = (320, 240), 16, 32
 
 
 @dataclass(frozen=True)
@@ -85,10 +91,35 @@ def detect(image: Image, detector: Detector, options: FeatureOptions) -> Feature
     """
     if min(image.shape[:2]) < _MIN_SIDE_PX:
         return _none(detector)
+    height, width = image.shape
+    most_px = _TILE_PX if detector == "sift" else (width, height)
+    parts, responses = [_none(detector)], [np.zeros(0)]
+    for top, bottom in _portions(height, most_px[1]):
+        for left, right in _portions(width, most_px[0]):
+            x, y = max(left - _BEYOND_TILE_PX, 0), max(top - _BEYOND_TILE_PX, 0)
+            tile = image[y : bottom + _BEYOND_TILE_PX, x : right + _BEYOND_TILE_PX]
+            found, response = _detected(tile, detector, options)
+            pixels = found.pixels + np.array([x, y])
+            is_own = np.all((pixels >= (left, top)) & (pixels < (right, bottom)), axis=1)
+            parts.append(Features(pixels[is_own], found.descriptors[is_own]))
+            responses.append(response[is_own])
+    features, response = joined_features(parts), np.concatenate(responses)
+    return features.subset(_spread(features.pixels, response, width, height, options.max_features))
+
+
+def _portions(length_px: int, most_px: int) -> Iterator[tuple[int, int]]:
+    """Return begin and end of equal parts of an image's side, hardly longer than they may be."""
+    n, step = -(-length_px // most_px), _TILES_STAND_AT_PX
+    cuts = (round(i * length_px / n / step) * step for i in range(1, n))
+    return itertools.pairwise((0, *cuts, length_px))
+
+
+def _detected(image: Image, detector: Detector, options: FeatureOptions) -> tuple[Features, Array]:
+    """Find all features of an image, and how strong they are."""
     with _one_at_a_time:
         keypoints, found = _engine(detector, options).detectAndCompute(image, None)
     if found is None or len(keypoints) == 0:
-        return _none(detector)
+        return _none(detector), np.zeros(0)
     pixels = np.array([k.pt for k in keypoints], dtype=np.float64)
     response = np.array([k.response for k in keypoints])
     descriptors: NDArray[np.uint8] | NDArray[np.float32]
@@ -96,8 +127,7 @@ def detect(image: Image, detector: Detector, options: FeatureOptions) -> Feature
         descriptors = _root_sift(np.asarray(found, dtype=np.float32))
     else:
         descriptors = np.asarray(found, dtype=np.uint8)
-    keep = _spread(pixels, response, image.shape[1], image.shape[0], options.max_features)
-    return Features(pixels[keep], descriptors[keep])
+    return Features(pixels, descriptors), response
 
 
 def _none(detector: Detector) -> Features:
