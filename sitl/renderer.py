@@ -18,11 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.sampling import sampled
-from sitl.world import SKY, Grey, Surface, Texture, World
+from sitl import render_kernels as kernels
+from sitl.world import SKY, Grey, Texture, World
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array
 
 Floats = NDArray[np.float32]
 
@@ -80,54 +79,16 @@ class _Samples:
             ideal = camera.ideal_from_pixels(pixels)
             if not np.all(np.isfinite(ideal)):
                 raise ValueError("the distortion cannot be inverted all over the image")
-            x, y = ideal[:, 0].reshape(self.shape), ideal[:, 1].reshape(self.shape)
-            self.x, self.y = x.astype(np.float32), y.astype(np.float32)
-        else:  # broadcasting one row against one column is several times cheaper
-            self.x = ((columns - camera.cx_px) / camera.fx_px).astype(np.float32)[None, :]
-            self.y = ((rows - camera.cy_px) / camera.fy_px).astype(np.float32)[:, None]
-        self.flat_x = np.ascontiguousarray(np.broadcast_to(self.x, self.shape)).ravel()
-        self.flat_y = np.ascontiguousarray(np.broadcast_to(self.y, self.shape)).ravel()
-        self.column_range = self.x.min(axis=0), self.x.max(axis=0)
-        self.row_range = self.y.min(axis=1), self.y.max(axis=1)
+        else:
+            x, y = np.meshgrid(
+                (columns - camera.cx_px) / camera.fx_px, (rows - camera.cy_px) / camera.fy_px
+            )
+            ideal = np.stack([x, y], axis=-1)
+        self.x, self.y = np.moveaxis(ideal.reshape(*self.shape, 2).astype(np.float32), 2, 0).copy()
+        self.of_columns = self.x.min(axis=0), self.x.max(axis=0)
+        self.of_rows = self.y.min(axis=1), self.y.max(axis=1)
         # One sample's area on the ideal plane, taken at the principal point.
         self.spacing = 1.0 / (camera.focal_px * per_pixel)
-
-    def box(self, corners_cam: Array) -> tuple[slice, slice] | None:
-        """Return rows and columns that may see a polygon, (K, 3) corners; None if none can."""
-        polygon = _in_front(corners_cam)
-        if len(polygon) == 0:
-            return None
-        ideal = polygon[:, :2] / polygon[:, 2:]
-        (left, top), (right, bottom) = ideal.min(axis=0), ideal.max(axis=0)
-        columns = np.flatnonzero((self.column_range[0] <= right) & (self.column_range[1] >= left))
-        rows = np.flatnonzero((self.row_range[0] <= bottom) & (self.row_range[1] >= top))
-        if len(columns) == 0 or len(rows) == 0:
-            return None
-        return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-
-
-def _in_front(corners_cam: Array) -> Array:
-    """Return the part of a convex polygon, (K, 3), that lies beyond the near plane."""
-    z = corners_cam[:, 2]
-    if z.min() >= _NEAR_M:
-        return corners_cam
-    kept = []
-    for i in range(len(corners_cam)):
-        j = (i + 1) % len(corners_cam)
-        if z[i] >= _NEAR_M:
-            kept.append(corners_cam[i])
-        if (z[i] >= _NEAR_M) != (z[j] >= _NEAR_M):
-            share = (_NEAR_M - z[i]) / (z[j] - z[i])
-            kept.append(corners_cam[i] + share * (corners_cam[j] - corners_cam[i]))
-    return np.array(kept).reshape(-1, 3)
-
-
-def _linear_forms(surface: Surface, cam_from_world: Pose) -> Array:
-    """Return the (3, 3) matrix that takes (x, y, 1) to (u, v, 1) / depth, u and v in metres."""
-    corner = cam_from_world.apply(surface.corner)
-    axes = np.stack([surface.right, surface.down], axis=1)
-    plane = np.column_stack([cam_from_world.rotation @ axes, corner])
-    return np.asarray(np.linalg.inv(plane), dtype=np.float64)
 
 
 class Renderer:
@@ -149,6 +110,14 @@ class Renderer:
             [[s.point(u, v) for u, v in _corners_m(s.width_m, s.height_m)] for s in surfaces]
         ).reshape(-1, 4, 3)
         self._outward = np.array([s.outward for s in surfaces]).reshape(-1, 3)
+        axes = [np.column_stack([s.right, s.down]) for s in surfaces]
+        self._axes = np.array(axes).reshape(-1, 3, 2)
+        sizes = [(s.width_m, s.height_m) for s in surfaces]
+        self._sizes = np.array(sizes, dtype=np.float32).reshape(-1, 2)
+        n_holes = [0, *(len(s.holes) for s in surfaces)]
+        self._first_hole = np.cumsum(n_holes, dtype=np.int64)
+        holes = [np.zeros((0, 4)), *(s.holes for s in surfaces)]
+        self._holes = np.concatenate(holes).astype(np.float32)
 
     def render(self, world_from_cam: Pose, rng: np.random.Generator | None = None) -> Grey:
         """Take a picture.
@@ -191,61 +160,34 @@ class Renderer:
 
     def _nearest(self, samples: _Samples, world_from_cam: Pose) -> tuple[Floats, NDArray[np.int16]]:
         """Return, for every sample, one over its depth (0 for sky) and the surface it sees."""
+        cam_from_world = world_from_cam.inverse()
+        corners = cam_from_world.apply(self._corners)
+        towards = world_from_cam.translation - self._corners[:, 0]
+        faces_us = np.einsum("mi,mi->m", self._outward, towards) > 1e-9
+        chosen = np.flatnonzero(faces_us & (corners[:, :, 2].max(axis=1) > _NEAR_M))
+        chosen = chosen[np.argsort(corners[chosen, :, 2].mean(axis=1), kind="stable")]
         inverse_depth = np.zeros(samples.shape, dtype=np.float32)
         nearest = np.full(samples.shape, SKY, dtype=np.int16)
-        cam_from_world = world_from_cam.inverse()
-        corners_cam = cam_from_world.apply(self._corners)
-        faces_us = (
-            np.einsum("mi,mi->m", self._outward, world_from_cam.translation - self._corners[:, 0])
-            > 1e-9
+        kernels.find_nearest(
+            chosen,
+            self._forms(chosen, cam_from_world),
+            kernels.boxes_of(corners[chosen], _NEAR_M, samples.of_columns, samples.of_rows),
+            self._sizes,
+            self._first_hole,
+            self._holes,
+            samples.x,
+            samples.y,
+            inverse_depth,
+            nearest,
         )
-        # Near ones first, so that most samples of what stands behind fail the first test.
-        order = np.argsort(corners_cam[:, :, 2].mean(axis=1))
-        for index in order[faces_us[order] & (corners_cam[order, :, 2].max(axis=1) > _NEAR_M)]:
-            box = samples.box(corners_cam[index])
-            if box is None:
-                continue
-            surface = self._world.surfaces[index]
-            forms = _linear_forms(surface, cam_from_world).astype(np.float32)
-            x, y = _part(samples, box)
-            q = forms[2, 0] * x + (forms[2, 1] * y + forms[2, 2])
-            seen = q > inverse_depth[box]
-            u = forms[0, 0] * x + (forms[0, 1] * y + forms[0, 2])
-            v = forms[1, 0] * x + (forms[1, 1] * y + forms[1, 2])
-            seen &= u >= 0.0
-            seen &= v >= 0.0
-            seen &= u <= np.float32(surface.width_m) * q
-            seen &= v <= np.float32(surface.height_m) * q
-            if len(surface.holes):
-                self._pierce(seen, samples, box, surface, cam_from_world, (u, v, q))
-            np.copyto(inverse_depth[box], q, where=seen)
-            np.copyto(nearest[box], np.int16(index), where=seen)
         return inverse_depth, nearest
 
-    @staticmethod
-    def _pierce(
-        seen: NDArray[np.bool_],
-        samples: _Samples,
-        box: tuple[slice, slice],
-        surface: Surface,
-        cam_from_world: Pose,
-        forms: tuple[Floats, Floats, Floats],
-    ) -> None:
-        """Clear in ``seen`` the samples of ``box`` that look through a hole of the surface."""
-        for left, top, right, bottom in surface.holes.tolist():
-            opening = [(left, top), (right, top), (right, bottom), (left, bottom)]
-            corners = cam_from_world.apply(np.array([surface.point(u, v) for u, v in opening]))
-            hole = samples.box(corners)
-            if hole is None:
-                continue
-            part = tuple(
-                slice(max(h.start, b.start) - b.start, max(0, min(h.stop, b.stop) - b.start))
-                for h, b in zip(hole, box, strict=True)
-            )
-            u, v, q = (form[part] for form in forms)
-            inside = (u > np.float32(left) * q) & (u < np.float32(right) * q)
-            inside &= (v > np.float32(top) * q) & (v < np.float32(bottom) * q)
-            seen[part] &= ~inside
+    def _forms(self, chosen: NDArray[np.int64], cam_from_world: Pose) -> Floats:
+        """Return (C, 3, 3) that take (x, y, 1) to (u, v, 1) / depth, u and v in metres."""
+        planes = np.empty((len(chosen), 3, 3))
+        planes[:, :, :2] = cam_from_world.rotation @ self._axes[chosen]
+        planes[:, :, 2] = cam_from_world.apply(self._corners[chosen, 0])
+        return np.linalg.inv(planes).astype(np.float32)
 
     def _shade(self, nearest: NDArray[np.int16], world_from_cam: Pose) -> Floats:
         """Return the (H S, W S) light of every sample, in grey levels."""
@@ -254,18 +196,19 @@ class Renderer:
         order = np.argsort(flat, kind="stable")  # a radix sort: gathers each surface's samples
         counts = np.bincount(flat + 1, minlength=len(self._world.surfaces) + 1)
         ends = np.cumsum(counts)
-        cam_from_world = world_from_cam.inverse()
-        samples = self._fine
-        for group in np.flatnonzero(counts):
+        x, y, spacing = self._fine.x.ravel(), self._fine.y.ravel(), self._fine.spacing
+        seen = np.flatnonzero(counts)
+        forms = self._forms(seen[seen > 0] - 1, world_from_cam.inverse())
+        if counts[0]:
+            members = order[: counts[0]]
+            _shade_sky(self._world.sky, world_from_cam, members, x[members], y[members], light)
+        for group, form in zip(seen[seen > 0], forms, strict=True):
             members = order[ends[group] - counts[group] : ends[group]]
-            x, y = samples.flat_x[members], samples.flat_y[members]
-            index = int(group) - 1
-            if index == SKY:
-                light[members] = _sky_light(self._world.sky, world_from_cam, x, y)
-                continue
-            surface = self._world.surfaces[index]
-            forms = _linear_forms(surface, cam_from_world)
-            light[members] = _surface_light(surface, forms, x, y, samples.spacing)
+            surface = self._world.surfaces[group - 1]
+            size, texture = (surface.width_m, surface.height_m), surface.texture
+            kernels.shade(
+                members, x, y, form, size, spacing, texture.texels, texture.shelves, light
+            )
         return light.reshape(nearest.shape)
 
 
@@ -273,38 +216,18 @@ def _corners_m(width_m: float, height_m: float) -> list[tuple[float, float]]:
     return [(0.0, 0.0), (width_m, 0.0), (width_m, height_m), (0.0, height_m)]
 
 
-def _part(samples: _Samples, box: tuple[slice, slice]) -> tuple[Floats, Floats]:
-    """Return the samples' ideal coordinates in a box, ready to broadcast."""
-    rows, columns = box
-    if samples.x.shape[0] == 1 and samples.y.shape[1] == 1:
-        return samples.x[:, columns], samples.y[rows]
-    return samples.x[box], samples.y[box]
-
-
-def _surface_light(surface: Surface, forms: Array, x: Floats, y: Floats, spacing: float) -> Floats:
-    """Return the (N,) light of samples (x, y) on a surface, filtered to the sample's footprint."""
-    a, b, c = forms.astype(np.float32).T
-    depth = 1.0 / (a[2] * x + (b[2] * y + c[2]))
-    u = (a[0] * x + (b[0] * y + c[0])) * depth
-    v = (a[1] * x + (b[1] * y + c[1])) * depth
-    height, width = surface.texture.levels[0].shape
-    # The footprint: between its geometric mean and its root mean square, which
-    # on grazing surfaces trades a little aliasing against losing all texture.
-    area = np.float32(abs(np.linalg.det(forms))) * depth * depth * depth
-    squares = np.square(a[0] - u * a[2]) + np.square(b[0] - u * b[2])
-    squares += np.square(a[1] - v * a[2]) + np.square(b[1] - v * b[2])
-    squares *= np.float32(0.5) * depth * depth
-    texels = spacing * np.sqrt(width * height / (surface.width_m * surface.height_m))
-    level = np.float32(0.25) * np.log2(area * squares) + np.float32(np.log2(texels))
-    return sampled(
-        surface.texture, u / np.float32(surface.width_m), v / np.float32(surface.height_m), level
-    )
-
-
-def _sky_light(sky: Texture, world_from_cam: Pose, x: Floats, y: Floats) -> Floats:
-    """Return the (N,) light of the sky in the directions (x, y, 1) of the camera."""
+def _shade_sky(
+    sky: Texture,
+    world_from_cam: Pose,
+    members: NDArray[np.int64],
+    x: Floats,
+    y: Floats,
+    light: Floats,
+) -> None:
+    """Enter the light of the sky in the (N,) directions (x, y, 1) of the camera."""
     r = world_from_cam.rotation.astype(np.float32)
     north, east, down = (r[i, 0] * x + (r[i, 1] * y + r[i, 2]) for i in range(3))
     length = np.sqrt(north * north + east * east + down * down)
     lift = 1.0 / (np.float32(0.2) * length + np.maximum(-down, 0.0)) / (2 * _SKY_HALF_SPAN)
-    return sampled(sky, 0.5 + north * lift, 0.5 + east * lift, np.zeros_like(x))
+    across, along = np.float32(0.5) + north * lift, np.float32(0.5) + east * lift
+    kernels.look_up(members, across, along, sky.texels, sky.shelves, light)

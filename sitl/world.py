@@ -40,14 +40,12 @@ class Texture:
     """A grey image stretched over a rectangle, with its halved copies for far views.
 
     Attributes:
-        levels: (H, W) images; the first is the finest, each next is the area
-            average of the one before at half its size (rounded up), the last
-            is a single texel wide or high. Each spans the whole rectangle:
-            texel (i, j) of a (h, w) level is the rectangle's part
-            [j/w, (j+1)/w] x [i/h, (i+1)/h].
+        texels: (T,) uint8, of all levels one after the other.
+        shelves: (L, 3) int64: where each level starts, its height and width.
     """
 
-    levels: tuple[Grey, ...]
+    texels: Grey
+    shelves: NDArray[np.int64]
 
     @classmethod
     def from_image(cls, image: Grey) -> Texture:
@@ -70,9 +68,23 @@ class Texture:
                 levels[-1], ((width + 1) // 2, (height + 1) // 2), interpolation=cv2.INTER_AREA
             )
             levels.append(np.asarray(halved, dtype=np.uint8))
-        for image_level in levels:
-            image_level.flags.writeable = False
-        return cls(tuple(levels))
+        texels = np.concatenate([image_level.ravel() for image_level in levels])
+        texels.flags.writeable = False
+        starts = np.cumsum([0, *(image_level.size for image_level in levels[:-1])])
+        return cls(texels, np.column_stack([starts, [each.shape for each in levels]]))
+
+    @property
+    def levels(self) -> tuple[Grey, ...]:
+        """(H, W) images; the first is the finest.
+
+        Each next is the area average of the one before at half its size (rounded up), the last is
+        a single texel wide or high. Each spans the whole rectangle: texel (i, j) of a (h, w) level
+        is the rectangle's part [j/w, (j+1)/w] x [i/h, (i+1)/h].
+        """
+        return tuple(
+            self.texels[start : start + height * width].reshape(height, width)
+            for start, height, width in self.shelves
+        )
 
 
 @dataclass(frozen=True, eq=False)
