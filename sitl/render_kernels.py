@@ -196,7 +196,8 @@ def _trilinear(texels: Texels, shelves: Ints, across: float, along: float, level
 
     ``level`` is the logarithm to base 2 of the footprint in texels of the finest one.
     """
-    level = min(max(level, 0.0), len(shelves) - 1.0)
+    # Written so that what is no number counts as zero: nothing else is looked up by it.
+    level = min(level, len(shelves) - 1.0) if level > 0.0 else 0.0
     lower = int(level)
     share = level - lower
     grey = _bilinear(texels, shelves[lower], across, along)
@@ -210,8 +211,9 @@ def _bilinear(texels: Texels, shelf: Ints, across: float, along: float) -> float
     """Return the light at fractions of one level; its edge texels go on beyond it."""
     start, height, width = shelf[0], shelf[1], shelf[2]
     # Texel (0, 0) is centred half a texel inside the rectangle.
-    u = min(max(across * width - 0.5, 0.0), width - 1.0)
-    v = min(max(along * height - 0.5, 0.0), height - 1.0)
+    u, v = across * width - 0.5, along * height - 0.5
+    u = min(u, width - 1.0) if u > 0.0 else 0.0
+    v = min(v, height - 1.0) if v > 0.0 else 0.0
     column, row = int(u), int(v)
     right = column + 1 if column + 1 < width else column
     under = row + 1 if row + 1 < height else row

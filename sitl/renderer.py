@@ -23,7 +23,7 @@ from sitl.world import SKY, Grey, Texture, World
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 
-Floats = NDArray[np.float32]
+Floats = kernels.Floats
 
 _NEAR_M = 0.02
 _SKY_HALF_SPAN = 5.0
@@ -197,14 +197,14 @@ class Renderer:
         counts = np.bincount(flat + 1, minlength=len(self._world.surfaces) + 1)
         ends = np.cumsum(counts)
         x, y, spacing = self._fine.x.ravel(), self._fine.y.ravel(), self._fine.spacing
-        seen = np.flatnonzero(counts)
-        forms = self._forms(seen[seen > 0] - 1, world_from_cam.inverse())
+        seen = np.flatnonzero(counts[1:])
+        forms = self._forms(seen, world_from_cam.inverse())
         if counts[0]:
             members = order[: counts[0]]
             _shade_sky(self._world.sky, world_from_cam, members, x[members], y[members], light)
-        for group, form in zip(seen[seen > 0], forms, strict=True):
-            members = order[ends[group] - counts[group] : ends[group]]
-            surface = self._world.surfaces[group - 1]
+        for index, form in zip(seen, forms, strict=True):
+            members = order[ends[index] : ends[index + 1]]
+            surface = self._world.surfaces[index]
             size, texture = (surface.width_m, surface.height_m), surface.texture
             kernels.shade(
                 members, x, y, form, size, spacing, texture.texels, texture.shelves, light

@@ -20,7 +20,7 @@ Grey = NDArray[np.uint8]
 
 SKY = -1
 _MIN_TEXTURE_PX = 2
-_MAX_TEXTURE_PX = 32000  # cv2.remap addresses its source with signed 16-bit integers
+_MAX_TEXTURE_PX = 32_000  # a gigabyte, where both sides are
 
 
 def _frozen(value: Array, shape: tuple[int, ...], name: str) -> Array:
@@ -71,7 +71,9 @@ class Texture:
         texels = np.concatenate([image_level.ravel() for image_level in levels])
         texels.flags.writeable = False
         starts = np.cumsum([0, *(image_level.size for image_level in levels[:-1])])
-        return cls(texels, np.column_stack([starts, [each.shape for each in levels]]))
+        shelves = np.column_stack([starts, [each.shape for each in levels]])
+        shelves.flags.writeable = False
+        return cls(texels, shelves)
 
     @property
     def levels(self) -> tuple[Grey, ...]:

@@ -25,7 +25,7 @@ from vcl_companion.geometry.rotation import Array, about_down, exp_so3
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.reconstruction import MapOptions, NoMap, reconstruct
-from vcl_companion.mapping.uncertainty import SHARED_NOISE_PX, map_uncertainty
+from vcl_companion.mapping.uncertainty import map_uncertainty, shared_noise_px
 from vcl_companion.mapping.visibility import choose_hypothesis
 from vcl_companion.vision.essential import RelativePose
 from vcl_companion.vision.features import Features
@@ -107,7 +107,8 @@ def test_keyframes_and_landmarks_err_as_much_as_stated() -> None:
         error_m = OPTIONS.distance_sigma_m * float(rng.standard_normal())
         found = built(rng, scene, distance_error_m=error_m)
         # What is allowed for errors that neighbours share is not in this scene.
-        alone_px = math.sqrt(found.pixel_noise_px**2 - SHARED_NOISE_PX**2)
+        shared_px2 = np.mean(np.square(shared_noise_px(found)[found.seen]))
+        alone_px = math.sqrt(found.pixel_noise_px**2 - shared_px2)
         uncertainty = map_uncertainty(replace(found, pixel_noise_px=alone_px))
         i = n_views - 1
         truth = world_from_scene() @ scene.bodies[i]

@@ -16,9 +16,11 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import KnownDistance, LandmarkMap
 from vcl_companion.mapping.uncertainty import (
-    NOISE_GROWTH,
+    REPEATED_NOISE_PX,
     SHARED_NOISE_PX,
+    SHARED_NOISE_PX_PER_DEG,
     map_uncertainty,
+    shared_noise_px,
     views_of,
 )
 from vcl_companion.vision.bundle import BundleOptions, Distance, adjust, normal_equations
@@ -31,8 +33,19 @@ def dense_covariance(landmark_map: LandmarkMap, looks_before: Array | float = 0.
         landmark_map: the map.
         looks_before: (N, V) how many rounds before had seen a landmark.
     """
-    shared = SHARED_NOISE_PX * np.sqrt(1.0 + NOISE_GROWTH * np.asarray(looks_before))
-    noise = np.hypot(landmark_map.pixel_noise_px, shared)[..., None, None]
+    aside_deg = np.zeros(landmark_map.seen.shape)
+    for j, k in np.argwhere(landmark_map.seen):
+        sights = [
+            landmark_map.points_world[j] - (frame.world_from_body @ frame.body_from_cam).translation
+            for frame in landmark_map.keyframes
+        ]
+        units = [sight / np.linalg.norm(sight) for sight in sights]
+        mean = np.sum([u for u, sees in zip(units, landmark_map.seen[j], strict=True) if sees], 0)
+        turned = np.linalg.norm(np.cross(units[k], mean)), units[k] @ mean
+        aside_deg[j, k] = np.rad2deg(np.arctan2(*turned))
+    repeated = REPEATED_NOISE_PX * np.sqrt(np.asarray(looks_before)) * np.ones(aside_deg.shape)
+    parts = (SHARED_NOISE_PX, SHARED_NOISE_PX_PER_DEG * aside_deg, landmark_map.pixel_noise_px)
+    noise = np.sqrt(repeated**2 + sum(np.square(part) for part in parts))[..., None, None]
     views = views_of(landmark_map)
     system = normal_equations(replace(views, slopes=views.slopes / noise), None)
     n_poses, n_points = len(system.pose_block), len(system.point_block)
@@ -196,9 +209,10 @@ def test_a_better_known_distance_is_a_better_scale() -> None:
 
 def test_a_map_is_never_taken_for_surer_than_detectors_are() -> None:
     good = map_of(facade_scene(np.random.default_rng(0), 40, n_views=3))
+    as_much_px = float(np.sqrt(np.mean(np.square(shared_noise_px(good)[good.seen]))))
     floor, silent, loud = (
         map_uncertainty(replace(good, pixel_noise_px=noise_px)).keyframe_covariance[6:, 6:]
-        for noise_px in (1e-12, 1e-300, SHARED_NOISE_PX)
+        for noise_px in (1e-12, 1e-300, as_much_px)
     )
     np.testing.assert_allclose(silent, floor, rtol=1e-9)
     assert np.trace(loud) == pytest.approx(2.0 * np.trace(floor), rel=0.1)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sitl.render_kernels import look_up
 from sitl.renderer import Imaging, Renderer
 from sitl.scenario import load_scenario
 from sitl.town import build_town
@@ -246,3 +247,53 @@ def test_the_demo_town_is_rich_and_its_corners_are_found_again(demo_world: World
     error = np.linalg.norm(sensor.camera.project(in_b) - b[solid], axis=1)
     assert (error < 2.0).sum() > 250
     assert float(np.median(error[error < 2.0])) < 0.7
+
+
+@pytest.mark.parametrize("shape", [(2, 9), (17, 2), (30, 41)])
+def test_light_between_texels_is_what_a_library_says(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(5)
+    image = rng.integers(0, 256, shape).astype(np.uint8)
+    texture = Texture.from_image(image)
+    edges = np.array([0.0, 1.0, 0.5 / shape[1], 1.0 - 0.5 / shape[0]])
+    across, along = (np.append(edges, rng.random(60)).astype(np.float32) for _ in range(2))
+    light = np.full(len(across), -1.0, dtype=np.float32)
+    members = np.arange(len(across), dtype=np.int64)
+    look_up(members, across, along, texture.texels, texture.shelves, light)
+    u, v = across * shape[1] - 0.5, along * shape[0] - 0.5
+    known = cv2.remap(
+        image.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    # A thirty-second of a texel is its finest step.
+    np.testing.assert_allclose(light, known.ravel(), atol=2 * 255.0 / 32.0)
+    assert np.mean(np.abs(light - known.ravel())) < 2.0
+    np.testing.assert_allclose(light[:2], [image[0, 0], image[-1, -1]], atol=1e-4)
+
+
+def test_a_place_that_is_no_number_is_looked_up_inside_the_texture() -> None:
+    texture = Texture.from_image(np.full((4, 4), 70, dtype=np.uint8))
+    nowhere = np.full(3, np.nan, dtype=np.float32)
+    light = np.zeros(3, dtype=np.float32)
+    look_up(np.arange(3), nowhere, nowhere, texture.texels, texture.shelves, light)
+    np.testing.assert_array_equal(light, 70.0)
+
+
+def test_a_floor_that_goes_on_below_the_camera_is_seen_to_the_image_s_edge() -> None:
+    """Two metres above a board, with a hole in it from 6 to 10 m ahead."""
+    board = Texture.from_image(np.full((40, 40), 120, dtype=np.uint8))
+    hole = np.array([[18.0, 10.0, 22.0, 14.0]])
+    corner, right, down = np.array([[20.0, -20.0, 2.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    floor = Surface(corner, right, down, 40.0, 40.0, board, hole)
+    renderer = Renderer(World((floor,), BACKGROUND), PINHOLE, CLEAN)
+    seen = renderer.depth(Pose(BODY_FROM_CAM_FORWARD, np.zeros(3)))
+    slope = (np.arange(480)[:, None] - PINHOLE.cy_px) / PINHOLE.fy_px
+    with np.errstate(divide="ignore"):
+        depth = np.where(slope > 0.0, 2.0 / slope, np.inf)
+    with np.errstate(invalid="ignore"):
+        aside = np.abs((np.arange(640)[None, :] - PINHOLE.cx_px) / PINHOLE.fx_px * depth)
+    through = (depth > 6.0) & (depth < 10.0) & (aside < 2.0)
+    shown = (depth < 20.0) & (aside < 20.0) & ~through
+    assert through.any()
+    assert shown[-1].all()
+    np.testing.assert_array_equal(seen.surface == 0, shown)
+    there = np.broadcast_to(depth, shown.shape)[shown]
+    np.testing.assert_allclose(seen.depth_m[shown], there, rtol=1e-5)

@@ -68,7 +68,10 @@ def test_who_will_have_lost_half_when_an_update_is_there_votes_before() -> None:
 @pytest.mark.parametrize(
     ("took_s", "foreseen_s"), [(0.5, 2.0), (2.0, 2.0), (3.0, 3.0), (4.0, 4.0), (30.0, 4.0)]
 )
-def test_what_takes_longer_is_foreseen_earlier(took_s: float, foreseen_s: float) -> None:
+@pytest.mark.parametrize("on_its_way", [0.0, 0.6])
+def test_what_takes_longer_is_foreseen_earlier(
+    took_s: float, foreseen_s: float, on_its_way: float
+) -> None:
     """Twenty landmarks a second: 240 are left after 8 s, and that is known so long before."""
     vote = OwnVote(OPTIONS)
     now_s = 0.0
@@ -76,19 +79,24 @@ def test_what_takes_longer_is_foreseen_earlier(took_s: float, foreseen_s: float)
     def look(revision: bytes, tracked: float, is_wanted: bool = False) -> bool:
         nonlocal now_s
         now_s += STEP_S
-        vote.follow(revision, is_wanted, now_s)
+        vote.follow(revision, is_wanted, False, now_s)
         return vote.look(revision, Sight(round(tracked)), now_s)
 
     while not look(FIRST, FEW):
         pass
     for _ in range(50):  # alone: as long as the others are content nothing is taken long over
         assert look(FIRST, FEW)
-    for _ in range(round(took_s / STEP_S)):
+    on_its_way_s = took_s * on_its_way
+    for _ in range(round((took_s - on_its_way_s) / STEP_S)):
         assert look(FIRST, FEW, is_wanted=True)
+    # Who made the map flies on it and tells so, which ends the wish, before all others have it.
+    for _ in range(round(on_its_way_s / STEP_S)):
+        now_s += STEP_S
+        vote.follow(FIRST, False, True, now_s)
     # As a daemon does: the map is there before a frame has been looked at on it, and for a moment
     # the others' wishes are those of before.
     now_s += STEP_S
-    vote.follow(SECOND, True, now_s)
+    vote.follow(SECOND, True, False, now_s)
     assert vote.unseen() is False
     for _ in range(20):
         wants = look(SECOND, PLENTY)
@@ -227,6 +235,9 @@ class Sky:
 
     def _step(self, own_id: int, member: Member) -> None:
         member.group.poll(self.now_s)
+        group = member.group
+        is_coming = group.newest_revision not in (b"", member.revision)
+        member.vote.follow(member.revision, group.majority_wants_update, is_coming, self.now_s)
         wants = member.vote.look(member.revision, Sight(member.tracked), self.now_s)
         before = member.group.state_of(own_id)
         state = MapState(member.revision, 0, member.tracked > 0, member.tracked, wants)

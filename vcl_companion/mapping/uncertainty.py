@@ -27,11 +27,13 @@ from vcl_companion.vision.schur import carried, eliminated
 # landmarks of little parallax leaves 1e-12 by rounding.
 _SINGULAR = 1e-11
 # What displaces a feature or a patch is alike in neighbouring ones, so that residuals tell too
-# little of it: it acts on keyframes like so much more independent noise. And from one look at a
-# landmark to the next it does not change its sign: a further one tells the less, the more rounds
-# have seen it before. NEES of keyframes rose so on rendered flights and on photographs.
-SHARED_NOISE_PX = 0.28
-NOISE_GROWTH = 2.5
+# little of it: it acts on keyframes like so much more independent noise, and the more so, the
+# farther aside of the others a view is. And from one look at a landmark to the next it does not
+# change its sign: a further one tells the less, the more rounds have seen it before. Keyframes'
+# NEES is so on rendered flights and on photographs.
+SHARED_NOISE_PX = 0.25
+SHARED_NOISE_PX_PER_DEG = 0.03
+REPEATED_NOISE_PX = 0.44
 _WIDER = 1.5
 # No distance between drones is known better; much smaller sigmas overflow.
 _FINEST_M = 1e-6
@@ -118,7 +120,8 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
         for some in _portions(n):
             part = _of(landmark_map, some)
             views = views_of(part)
-            scaled = replace(views, slopes=views.slopes / _noise_px(part)[..., None, None])
+            noise_px = np.hypot(part.pixel_noise_px, shared_noise_px(part))
+            scaled = replace(views, slopes=views.slopes / noise_px[..., None, None])
             system = normal_equations(scaled, None)
             inverse[some] = _inverse(system.point_block)
             lever[some] = -np.swapaxes(system.cross @ inverse[some], 1, 2)
@@ -143,15 +146,25 @@ def _of(landmark_map: LandmarkMap, some: slice) -> LandmarkMap:
     )
 
 
-def _noise_px(landmark_map: LandmarkMap) -> Array:
-    """Return (N, V) noise of the observations, px, 1 sigma."""
+def shared_noise_px(landmark_map: LandmarkMap) -> Array:
+    """Return (N, V) what observations err by alike in neighbouring ones, px, 1 sigma."""
     rounds, seen = _rounds(landmark_map.keyframes), landmark_map.seen
     in_round = np.zeros((len(seen), rounds[-1] + 1), dtype=np.int64)
     for i, k in enumerate(rounds):
         in_round[:, k] |= seen[:, i]
     before = (np.cumsum(in_round, axis=1) - in_round)[:, rounds]
-    shared_px = SHARED_NOISE_PX * np.sqrt(1.0 + NOISE_GROWTH * before)
-    return np.asarray(np.hypot(landmark_map.pixel_noise_px, shared_px))
+    aside_px = SHARED_NOISE_PX_PER_DEG * _aside_deg(landmark_map)
+    return np.asarray(np.sqrt(SHARED_NOISE_PX**2 + aside_px**2 + REPEATED_NOISE_PX**2 * before))
+
+
+def _aside_deg(landmark_map: LandmarkMap) -> Array:
+    """Return (N, V) how far each line of sight to a landmark lies aside of their mean, degrees."""
+    cams = [k.world_from_body @ k.body_from_cam for k in landmark_map.keyframes]
+    sight = landmark_map.points_world[:, None] - np.stack([cam.translation for cam in cams])
+    sight /= np.linalg.norm(sight, axis=2, keepdims=True)
+    mean = np.where(landmark_map.seen[..., None], sight, 0.0).sum(axis=1)
+    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+    return np.asarray(np.rad2deg(np.arccos(np.clip(np.einsum("nvi,ni->nv", sight, mean), -1, 1))))
 
 
 def _rounds(keyframes: tuple[Keyframe, ...]) -> list[int]:

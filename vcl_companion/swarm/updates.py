@@ -191,23 +191,24 @@ class OwnVote:
         self._wanted_since_s: float | None = None
         self._took_s = 0.0
 
-    def follow(self, revision: bytes, is_wanted: bool, now_s: float) -> None:
+    def follow(self, revision: bytes, is_wanted: bool, is_coming: bool, now_s: float) -> None:
         """Take note of how long updates take; call it before each ``look`` and ``unseen``.
 
         Args:
             revision: of the map in use; empty for none.
             is_wanted: whether the majority wants it updated. From that on, not from our own vote:
                 one that is alone waits for the others, and would look ahead the further for it.
+            is_coming: whether others fly on a newer one, and so want no update any more.
             now_s: not before the last call's.
         """
         if revision != self._used:
-            if self._wanted_since_s is not None:
+            if self._used and self._wanted_since_s is not None:
                 self._took_s = now_s - self._wanted_since_s
             self._used, self._wanted_since_s = revision, None
-        elif not is_wanted:
-            self._wanted_since_s = None
-        elif self._wanted_since_s is None:
+        elif is_wanted and self._wanted_since_s is None:
             self._wanted_since_s = now_s
+        elif not (is_wanted or is_coming):
+            self._wanted_since_s = None
 
     def look(self, revision: bytes, sight: Sight, now_s: float) -> bool:
         """Take in what is seen now; call it several times a second.

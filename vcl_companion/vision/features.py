@@ -22,9 +22,9 @@ _MIN_SIDE_PX = 32
 
 # For a moment AKAZE takes 30 MB for an image of 640 x 480: one thread after the other.
 _one_at_a_time = threading.Lock()
-# SIFT takes 200 bytes a pixel, so it looks at tiles: at most so large, at a multiple of what its
-# coarser octaves leave out, and so far beyond their borders as all but one in a hundred features
-# reach (these are found there as in the whole image; the others a little displaced).
+# SIFT takes 200 bytes a pixel, so it looks at tiles: of about this size, cut at a multiple of what
+# its coarser octaves leave out, with so much of the image around each as all but one in a hundred
+# features of a sharp image reach (coarser ones near a cut are a little displaced, or missing).
 _TILE_PX, _TILES_STAND_AT_PX, _BEYOND_TILE_PX = (320, 240), 16, 32
 
 
@@ -89,9 +89,9 @@ def detect(image: Image, detector: Detector, options: FeatureOptions) -> Feature
         places; none in an image too small to hold any. SIFT may put several, one
         per dominant direction, at one position.
     """
-    if min(image.shape[:2]) < _MIN_SIDE_PX:
-        return _none(detector)
     height, width = image.shape
+    if min(height, width) < _MIN_SIDE_PX:
+        return _none(detector)
     most_px = _TILE_PX if detector == "sift" else (width, height)
     parts, responses = [_none(detector)], [np.zeros(0)]
     for top, bottom in _portions(height, most_px[1]):
