@@ -66,7 +66,7 @@ def test_the_same_image_gives_the_same_features(detector: Detector) -> None:
 def test_tiles_of_an_image_show_what_the_whole_image_does(size_px: tuple[int, int]) -> None:
     rng = np.random.default_rng(13)
     coarse, fine = (rng.normal(0.0, 60.0, (size_px[1], size_px[0])) for _ in range(2))
-    grey = 12.0 * cv2.GaussianBlur(coarse, None, 8.0) + 3.0 * cv2.GaussianBlur(fine, None, 1.5)
+    grey = 12.0 * cv2.GaussianBlur(coarse, (0, 0), 8.0) + 3.0 * cv2.GaussianBlur(fine, (0, 0), 1.5)
     image = np.clip(120.0 + grey, 0, 255).astype(np.uint8)
     every = FeatureOptions(max_features=20_000)
     tiled = detect(image, "sift", every)
