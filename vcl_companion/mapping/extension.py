@@ -26,6 +26,7 @@ from vcl_companion.mapping.new_landmarks import Shown, free_of, new_landmarks, s
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.patch_table import PatchTable, PyramidOf, Reference, pyramids_of
 from vcl_companion.mapping.placing import Placed, place, references
+from vcl_companion.mapping.sharpening import SETTLED_CAUCHY_PX
 from vcl_companion.mapping.thinning import spread
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.mapping.uncertainty import MapUncertainty, views_of
@@ -45,9 +46,8 @@ _STEPS, _LEAST_GAIN = (8, 12), (1e-3, 1e-4)
 # those that share so many landmarks with the new views. The other half holds the scale, which
 # would go a little wrong each time with nothing but far keyframes to hold it.
 _NEAREST, _SHARED = 9, 40
-_CAUCHY_PX = 0.5
 # Residuals of patches that are the same spot: first loosely, by poses not adjusted yet.
-_LIMIT_PX = (1.5, 0.5)
+_LIMIT_PX, _CAUCHY_PX = (1.5, 0.5), (0.5, SETTLED_CAUCHY_PX)
 _MAX_SIGMAS = 4.0
 
 
@@ -218,7 +218,10 @@ class Extension:
         fits, good = fitting(views, 2.0 * limit_px, self._options)
         views = replace(views, ideal=np.where(fits[..., None], ideal, np.nan))
         views, noise_px = _adjusted_near(
-            views, good, self._n_keys, BundleOptions(_STEPS[turn], _CAUCHY_PX, _LEAST_GAIN[turn])
+            views,
+            good,
+            self._n_keys,
+            BundleOptions(_STEPS[turn], _CAUCHY_PX[turn], _LEAST_GAIN[turn]),
         )
         fits, again = fitting(views, max(_LIMIT_PX[turn], _MAX_SIGMAS * noise_px), self._options)
         observed = np.where(fits[..., None], table.observed, np.nan)
