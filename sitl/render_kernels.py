@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.vision.compiled import compiled
 
+# Of a texel.
+_STEPS = 32
+
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Texels = NDArray[np.uint8]
@@ -208,17 +211,23 @@ def _trilinear(texels: Texels, shelves: Ints, across: float, along: float, level
 
 @compiled
 def _bilinear(texels: Texels, shelf: Ints, across: float, along: float) -> float:
-    """Return the light at fractions of one level; its edge texels go on beyond it."""
+    """Return the light at fractions of one level; its edge texels go on beyond it.
+
+    As OpenCV's ``remap`` does it, to a thirty-second of a texel and to whole grey levels: pictures
+    of a scenario stay what they were.
+    """
     start, height, width = shelf[0], shelf[1], shelf[2]
     # Texel (0, 0) is centred half a texel inside the rectangle.
     u, v = across * width - 0.5, along * height - 0.5
     u = min(u, width - 1.0) if u > 0.0 else 0.0
     v = min(v, height - 1.0) if v > 0.0 else 0.0
-    column, row = int(u), int(v)
+    fine_u, fine_v = int(np.rint(u * _STEPS)), int(np.rint(v * _STEPS))
+    column, row = fine_u // _STEPS, fine_v // _STEPS
     right = column + 1 if column + 1 < width else column
     under = row + 1 if row + 1 < height else row
-    a, b = u - column, v - row
+    a, b = fine_u - column * _STEPS, fine_v - row * _STEPS
     above, below = start + row * width, start + under * width
-    upper = texels[above + column] + a * (texels[above + right] - float(texels[above + column]))
-    lower = texels[below + column] + a * (texels[below + right] - float(texels[below + column]))
-    return float(upper + b * (lower - upper))
+    upper = (_STEPS - a) * int(texels[above + column]) + a * int(texels[above + right])
+    lower = (_STEPS - a) * int(texels[below + column]) + a * int(texels[below + right])
+    half = _STEPS * _STEPS // 2
+    return float(((_STEPS - b) * upper + b * lower + half) // (_STEPS * _STEPS))

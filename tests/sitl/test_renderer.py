@@ -260,12 +260,8 @@ def test_light_between_texels_is_what_a_library_says(shape: tuple[int, int]) -> 
     members = np.arange(len(across), dtype=np.int64)
     look_up(members, across, along, texture.texels, texture.shelves, light)
     u, v = across * shape[1] - 0.5, along * shape[0] - 0.5
-    known = cv2.remap(
-        image.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    # A thirty-second of a texel is its finest step.
-    np.testing.assert_allclose(light, known.ravel(), atol=2 * 255.0 / 32.0)
-    assert np.mean(np.abs(light - known.ravel())) < 2.0
+    known = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    np.testing.assert_allclose(light, known.ravel(), atol=1.0)
     np.testing.assert_allclose(light[:2], [image[0, 0], image[-1, -1]], atol=1e-4)
 
 
