@@ -236,7 +236,7 @@ class Sky:
     def _step(self, own_id: int, member: Member) -> None:
         member.group.poll(self.now_s)
         group = member.group
-        is_coming = group.newest_revision not in (b"", member.revision)
+        is_coming = own_id in group.lacking()
         member.vote.follow(member.revision, group.majority_wants_update, is_coming, self.now_s)
         wants = member.vote.look(member.revision, Sight(member.tracked), self.now_s)
         before = member.group.state_of(own_id)

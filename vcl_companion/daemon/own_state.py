@@ -112,9 +112,9 @@ class OwnState:
         before = self._wants_update
         seen = self._estimator
         revision = stored.revision if stored else b""
-        told = stored.told_revision if stored else b""
-        is_coming = self._group.newest_revision not in (b"", told)
-        self._vote.follow(revision, self._group.majority_wants_update, is_coming, now_s)
+        group = self._group
+        is_coming = group.own_id in group.lacking()
+        self._vote.follow(revision, group.majority_wants_update, is_coming, now_s)
         if stored is not None and seen.seen_on != stored.revision:
             self._wants_update = self._vote.unseen()
             return self._wants_update != before
