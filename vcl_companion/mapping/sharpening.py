@@ -16,6 +16,7 @@ from vcl_companion.mapping.patch_table import (
     decoded_pyramid,
     pyramids_of,
 )
+from vcl_companion.mapping.strays import strays
 from vcl_companion.mapping.uncertainty import views_of
 from vcl_companion.vision.bundle import BundleOptions, adjust
 from vcl_companion.vision.patches import AlignRules
@@ -87,12 +88,20 @@ def _round(
     best[landmark[rising]] = rising
     kept = np.flatnonzero(best >= 0)
     kept = kept[count[best[kept]] >= 2]
+    cameras = [k.camera for k in landmark_map.keyframes]
+    points, observed, cut_from = (
+        landmark_map.points_world[kept],
+        found[best[kept]],
+        view[best[kept]],
+    )
+    observed[strays(points, observed, cut_from, cameras, cams)] = np.nan
+    still = np.isfinite(observed[:, :, 0]).sum(axis=1) >= 2
     measured = replace(
         landmark_map,
-        points_world=landmark_map.points_world[kept],
-        observed_px=found[best[kept]],
+        points_world=points[still],
+        observed_px=observed[still],
     )
-    if len(kept) < options.min_landmarks:
+    if len(measured.points_world) < options.min_landmarks:
         return measured
     return _adjusted(measured, cauchy_px, options)
 

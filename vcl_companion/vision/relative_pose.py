@@ -38,6 +38,8 @@ _ROUNDS_OF_A_REFIT = 6
 # Poses with this share of the best one's inliers in front of both cameras are judged as well.
 _CHEIRALITY_TIE = 0.5
 _SURE_SIGMAS = 3.0
+THRESHOLD_SIGMAS = 2.5
+"""What a threshold found from the data is taken for, in sigmas of the noise behind it."""
 # One hypothesis found twice, whatever the noise.
 _SAME_TURN_RAD = np.deg2rad(0.3)
 _SAME_DIRECTION_RAD = np.deg2rad(1.5)
@@ -119,7 +121,7 @@ class RelativePoseProblem:
         """Return the essential matrix most likely to be behind all matches."""
         return refined_essential(
             model, self.a, self.b, self.focal_px,
-            threshold / 2.5, np.exp(self.log_alpha), _ROUNDS_OF_A_REFIT,
+            threshold / THRESHOLD_SIGMAS, np.exp(self.log_alpha), _ROUNDS_OF_A_REFIT,
         )  # fmt: skip
 
     def refined(self, pose: Pose, threshold_px: float, rounds: int = _ROUNDS) -> tuple[Pose, float]:
@@ -127,7 +129,8 @@ class RelativePoseProblem:
         rotation, direction, sigma, _ = refined_pose(
             np.array(pose.rotation, order="C"),
             pose.translation.copy(),
-            self.a, self.b, self.focal_px, threshold_px / 2.5, np.exp(self.log_alpha), rounds,
+            self.a, self.b, self.focal_px,
+            threshold_px / THRESHOLD_SIGMAS, np.exp(self.log_alpha), rounds,
         )  # fmt: skip
         return Pose(rotation, direction), sigma
 
@@ -166,13 +169,10 @@ def essential_candidates(
         than chance. Two that are nearly as plausible are planar twins: what else
         is known has to decide.
     """
-    # A kernel is compiled once more for arrays that may not be written, and for integers.
-    focal_px = float(focal_px)
-    a, b = (np.array(side, dtype=np.float64, order="C") for side in (ideal_a, ideal_b))
-    if len(a) <= SAMPLE_SIZE + 1:
+    if len(ideal_a) <= SAMPLE_SIZE + 1:
         return []
-    diagonal, area = _extent_px(a, b, focal_px)
-    problem = RelativePoseProblem(a, b, focal_px, diagonal, area)
+    problem = relative_pose_problem(ideal_a, ideal_b, focal_px)
+    a, b, focal_px, area = problem.a, problem.b, problem.focal_px, problem.area_px2
     judged: list[RelativeCandidate] = []
     found = ac_ransac(problem, rng, options)
     if not isinstance(found, NotFound):
@@ -188,8 +188,16 @@ def essential_candidates(
     # A guess too large only lets more pass for in front than is.
     sigma = min((c.sigma_px for c in believed), default=1.0)
     if not isinstance(plane, NotFound):
-        near_plane = (plane.inliers, plane.threshold_px / 2.5)
+        near_plane = (plane.inliers, plane.threshold_px / THRESHOLD_SIGMAS)
     return _distinct(problem, [_weighed(problem, c, near_plane, sigma) for c in believed])
+
+
+def relative_pose_problem(ideal_a: Array, ideal_b: Array, focal_px: float) -> RelativePoseProblem:
+    """Return what ``ac_ransac`` searches: (M, 2) ideal image coordinates, px per ideal unit."""
+    # A kernel is compiled once more for arrays that may not be written, and for integers.
+    focal_px = float(focal_px)
+    a, b = (np.array(side, dtype=np.float64, order="C") for side in (ideal_a, ideal_b))
+    return RelativePoseProblem(a, b, focal_px, *_extent_px(a, b, focal_px))
 
 
 def poses_of_essential(essential: Array) -> list[Pose]:

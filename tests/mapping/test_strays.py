@@ -1,0 +1,73 @@
+"""Windows taken for the next one: far behind the wall, and bending the poses that fit them."""
+
+import numpy as np
+import pytest
+
+from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import exp_so3
+from vcl_companion.mapping.strays import strays
+
+CAMERA = Camera(640, 480, 540.0, 540.0, 319.5, 239.5)
+WALL, NEAR, WRONG = 400, 40, 40
+BENT_DEG = 0.05
+
+
+class Facade:
+    """A slanted wall, something before it, and windows found in the next window's place."""
+
+    def __init__(self, noise_px: float) -> None:
+        rng = np.random.default_rng(5)
+        n = WALL + NEAR + WRONG
+        pixels = rng.uniform([20.0, 20.0], [620.0, 460.0], (n, 2))
+        depth = 20.0 + 0.02 * pixels[:, 0]
+        depth[WALL : WALL + NEAR] = 8.0
+        rays = np.hstack([CAMERA.ideal_from_pixels(pixels), np.ones((n, 1))])
+        self.points = rays * depth[:, None]
+        turn = exp_so3(np.array([0.02, -0.1, 0.01]))
+        other = Pose(turn, np.array([4.0, 0.3, 0.5]))
+        # Some 60 px farther along the epipolar line, nearly: ten times as deep.
+        self.points[WALL + NEAR :] *= 10.0
+        there = CAMERA.project(other.inverse().apply(self.points))
+        there[WALL + NEAR :, 1] += rng.normal(max(1.0, 10.0 * noise_px), 0.1, WRONG)
+        there += rng.normal(0.0, noise_px, there.shape)
+        self.observed_px = np.stack([pixels, there], axis=1)
+        bent = Pose(turn @ exp_so3(np.deg2rad([BENT_DEG, 0.0, 0.0])), other.translation)
+        self.cams = [Pose.identity(), bent]
+        self.is_wrong = np.arange(n) >= WALL + NEAR
+
+
+@pytest.mark.parametrize("noise_px", [0.03, 0.1, 0.2])
+@pytest.mark.parametrize("cut_from", [0, 1])
+def test_what_lies_behind_its_neighbours_and_aside_of_their_lines_is_found(
+    noise_px: float, cut_from: int
+) -> None:
+    scene = Facade(noise_px)
+    reference = np.full(len(scene.points), cut_from, dtype=np.intp)
+
+    found = strays(scene.points, scene.observed_px, reference, [CAMERA] * 2, scene.cams)
+
+    assert not found[:, cut_from].any()
+    other = found[:, 1 - cut_from]
+    assert other[scene.is_wrong].mean() > 0.9
+    assert other[~scene.is_wrong].mean() < 0.01
+
+
+def test_what_stands_before_a_wall_stays_for_it_fits_the_pose() -> None:
+    scene = Facade(0.05)
+    reference = np.zeros(len(scene.points), dtype=np.intp)
+
+    found = strays(scene.points, scene.observed_px, reference, [CAMERA] * 2, scene.cams)
+
+    assert not found[WALL : WALL + NEAR].any()
+
+
+def test_a_view_that_finds_little_is_left_alone() -> None:
+    scene = Facade(0.05)
+    few = np.arange(len(scene.points)) >= len(scene.points) - 30
+    observed = np.where(few[:, None, None], scene.observed_px, np.nan)
+
+    reference = np.zeros(len(scene.points), dtype=np.intp)
+    found = strays(scene.points, observed, reference, [CAMERA] * 2, scene.cams)
+
+    assert not found.any()
