@@ -54,6 +54,15 @@ def test_one_bad_frame_changes_nothing() -> None:
     assert not voted([PLENTY] * 20 + [1500, 1500] + [PLENTY] * 20)
 
 
+def test_a_hundred_looks_in_a_moment_count_as_one() -> None:
+    vote = OwnVote(OPTIONS)
+    times = [0.1 * k for k in range(20)] + [1.95 + 0.001 * k for k in range(100)]
+    sights = [PLENTY] * 20 + [0] * 100
+    votes = [vote.look(FIRST, Sight(n), at_s) for at_s, n in zip(times, sights, strict=True)]
+    assert not any(votes)
+    assert any(vote.look(FIRST, Sight(0), 2.1 + 0.1 * k) for k in range(8))
+
+
 def test_who_will_have_lost_half_when_an_update_is_there_votes_before() -> None:
     """Sixty landmarks a second: below 0.6 of 400 after 2.7 s, foreseen when that is a course."""
     falling = [PLENTY] * 20 + [PLENTY - 6 * k for k in range(40)]

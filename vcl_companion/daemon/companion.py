@@ -260,6 +260,7 @@ class Companion:
                     return await self._localize(frame, self._maps.current or stored)
             elif not _is(self._searched, stored) or now_s >= self._search_again_at_s:
                 self._search_over.clear()
+                self._estimator.sought_since_s = now_s
                 self._sought_at_ns = frame.captured_at_ns
                 may_fall_back = now_s >= self._fell_back_at_s + _FALL_BACK_EVERY_S
                 return _Sought(frame, ned_from_body, stored, may_fall_back)
@@ -306,6 +307,7 @@ class Companion:
                 await self._look_again(*behind)
         finally:
             self._search_over.set()
+            self._estimator.sought_since_s = None
             while (behind := self._behind.take()) is not None:
                 self._give_up(*behind)
         return await self._ask(frame, sought.ned_from_body, stored, refused)

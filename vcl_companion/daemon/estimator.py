@@ -88,6 +88,8 @@ class Estimator:
         """Share of the last frame that they filled; 0 when it was refused."""
         self.seen_on = b""
         """Revision of the map that the last frame was looked at on."""
+        self.sought_since_s: float | None = None
+        """Since when a frame is looked for by its features, by the loop's time; None: none is."""
         self.novelty_deg = 0.0
         """How differently they looked there from how they are remembered, degrees."""
 

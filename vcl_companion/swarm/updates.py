@@ -34,6 +34,9 @@ from vcl_companion.swarm.group import Group
 
 # One bad frame is no reason to vote: a vote is about the median of so long, s.
 _WINDOW_S = 1.0
+# Looks that come sooner after each other are one: the window's median is of its time, and who is
+# told much at a time would look a hundred times at one frame.
+_LOOKS_APART_S = 0.04
 # A new map is not judged by less than this share of the window, nor where it leads by less
 # than nearly all of it.
 _JUDGED_SHARE = 0.5
@@ -229,7 +232,10 @@ class OwnVote:
             self._since_s = now_s
             self._most = self._most_covered = 0.0
             self._least_sigma_m = math.inf
-        self._seen.append((now_s, sight))
+        at_s = now_s
+        if self._seen and now_s < self._seen[-1][0] + _LOOKS_APART_S:
+            at_s, _ = self._seen.pop()
+        self._seen.append((at_s, sight))
         while self._seen[0][0] < now_s - _WINDOW_S:
             self._seen.popleft()
         if not revision or not (self.options.tracked or self.options.share):

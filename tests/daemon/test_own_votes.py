@@ -1,0 +1,57 @@
+"""What a drone votes by while a frame is looked for by its features."""
+
+import asyncio
+from pathlib import Path
+
+from tests.daemon.swarm import Drone, swarm
+from tests.daemon.waiting import passes, passes_until, run
+from vcl_companion.swarm.updates import UpdateOptions
+
+PLENTY = 500
+
+
+def wants(drone: Drone) -> bool:
+    state = drone.group.state_of(1)
+    return state is not None and state.wants_update
+
+
+def seek(drone: Drone) -> None:
+    """Have the drone refuse a frame by its patches, and look for it by its features."""
+    drone.track(0)
+    drone.estimator.sought_since_s = asyncio.get_running_loop().time()
+
+
+def find(drone: Drone) -> None:
+    drone.estimator.sought_since_s = None
+    drone.track(PLENTY)
+
+
+def test_a_frame_that_is_found_by_its_features_a_moment_later_is_no_reason(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            one = await members.start(1, flies_on=(1, 2), update=UpdateOptions())
+            for _ in range(4):  # most of the time nothing is known
+                find(one)
+                await passes(0.25)
+                for _ in range(3):
+                    seek(one)
+                    await passes(0.25)
+            find(one)
+            await passes(1.0)
+            assert not wants(one)
+            assert one.events("vote") == []
+
+    run(scenario())
+
+
+def test_a_frame_that_is_long_looked_for_shows_nothing(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            one = await members.start(1, flies_on=(1, 2), update=UpdateOptions())
+            find(one)
+            await passes(2.0)
+            assert not wants(one)
+            seek(one)
+            await passes_until(lambda: wants(one), at_most_s=2.0)
+
+    run(scenario())
