@@ -392,10 +392,12 @@ def test_a_frame_that_is_looked_for_leads_those_that_came_meanwhile(tmp_path: Pa
                 await until(partial(up.estimator.has_looked_at, shot.at_ns))
             assert up.frames() == []
             assert up.estimator.seen_on == b""  # what the map lacks cannot be said yet
+            assert up.estimator.sought_since_s is not None
             up.shop.is_open.set()
             await up.server.answered()
             assert sorted(up.frames()) == [(k, "localized", None) for k in range(4)]
             assert up.estimator.seen_on != b""
+            assert up.estimator.sought_since_s is None
             # Which speed that is nobody knew before; the next one is found at once.
             up.shop.is_open.clear()
             up.give(4)

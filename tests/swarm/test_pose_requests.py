@@ -63,10 +63,14 @@ def test_only_who_was_surer_of_us_lately_may_know_better() -> None:
     assert not may(MAP, 31)
     choice.answered(2, 0.19, 0.2, 35 * SECOND)  # as sure as we are: it flies on the same map
     assert not may(MAP, 36)
-    choice.answered(2, 10.0, math.inf, 36 * SECOND)  # we knew nothing
+    choice.answered(2, 0.1, 0.2, 36 * SECOND)
     assert may(MAP, 37)
+    choice.answered(2, 0.1, math.inf, 37 * SECOND)  # than one who knew nothing: we do now
+    assert not may(MAP, 38)
+    assert choice.may_know_better(MAP, 38 * SECOND, is_weak=True)
+    choice.answered(2, 0.1, 0.2, 38 * SECOND)
     choice.lost(2)
-    assert not may(MAP, 37)
+    assert not may(MAP, 39)
 
 
 def test_who_knows_little_asks_those_who_have_not_shown_lately_that_they_know_no_better() -> None:

@@ -357,9 +357,14 @@ class Companion:
         stored: StoredMap,
         refused: NotLocalized | None,
     ) -> _Sought | _AskedPeers | None:
-        """Answer a frame that has been looked at, unless peers are asked about it."""
+        """Answer a frame that has been looked at, unless peers are asked about it.
+
+        What an older frame's search leads in a moment is not asked of peers meanwhile.
+        """
         sigma_m = math.inf if refused else self._estimator.sigma_m
-        asked = self._inter.begin(frame, ned_from_body, stored.revision, sigma_m)
+        asked = None
+        if not (refused and self._estimator.is_being_sought(asyncio.get_running_loop().time())):
+            asked = self._inter.begin(frame, ned_from_body, stored.revision, sigma_m)
         if asked is not None:
             points_world = stored.index.landmark_map.points_world
             return _AskedPeers(asked, weakref.ref(stored), points_world, refused)

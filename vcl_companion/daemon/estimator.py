@@ -37,6 +37,8 @@ from vcl_companion.localization.pose_history import PoseHistory
 _MAX_CONTRADICTED = 5
 # How far back a proposal may reach; a peer that takes longer speaks of another place.
 HISTORY_S = 5.0
+# A small map is looked through in so long.
+_SOUGHT_S = 0.5
 # A fix this old is no more where we are.
 _FRESH_NS = 2_000_000_000
 _LEAST_ARM_M = 1.0
@@ -138,6 +140,13 @@ class Estimator:
             return None
         pose = state.world_from_body
         return Pose(pose.rotation, pose.translation + ahead_s * state.velocity_world)
+
+    def is_being_sought(self, now_s: float) -> bool:
+        """Whether a frame is looked for by its features, and was not before a moment ago.
+
+        What it and those after it show is not known until then; where it takes long, it is nothing.
+        """
+        return self.sought_since_s is not None and now_s < self.sought_since_s + _SOUGHT_S
 
     def forget(self) -> None:
         """Know nothing of where we are any more: the next frame is looked for everywhere."""

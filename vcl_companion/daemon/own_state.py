@@ -20,9 +20,6 @@ _INTERVAL_S = 1.0
 _AT_REST_S = 2.0
 # So much more or less of the map in sight is news.
 _NEWS_SHARE = 0.1
-# What a frame shows that is looked for by its features is known a moment later. Where that takes
-# longer, it is nothing.
-_SOUGHT_S = 0.5
 # Who joins is told soon, and all who join meanwhile with it: a group starts at one time.
 _TO_NEW_S = 0.2
 
@@ -121,8 +118,7 @@ class OwnState:
         if stored is not None and seen.seen_on != stored.revision:
             self._wants_update = self._vote.unseen()
             return self._wants_update != before
-        sought_since_s = seen.sought_since_s
-        if sought_since_s is not None and now_s < sought_since_s + _SOUGHT_S:
+        if seen.is_being_sought(now_s):
             return False
         sigma_m = seen.sigma_m if seen.tracked else None
         self._wants_update = self._vote.look(

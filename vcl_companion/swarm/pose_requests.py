@@ -70,10 +70,13 @@ _SURER = 0.8
 
 @dataclass(frozen=True)
 class _Answer:
-    """How sure a peer's last answer was: its position's 1 sigma, m, and as a share of our own."""
+    """How sure a peer's last answer was: its position's 1 sigma, m, and as a share of our own.
+
+    None for that where we knew nothing: it says of those who know something only how sure it was.
+    """
 
     sigma_m: float
-    share: float
+    share: float | None
     at_ns: int
 
 
@@ -124,7 +127,11 @@ class HostChoice:
             own_sigma_m: what we knew ourselves; infinite for nothing.
             at_ns: when.
         """
-        share = math.inf if math.isinf(sigma_m) else sigma_m / own_sigma_m
+        share = None
+        if math.isinf(sigma_m):
+            share = math.inf
+        elif math.isfinite(own_sigma_m):
+            share = sigma_m / own_sigma_m
         self._told[peer] = _Answer(sigma_m, share, at_ns)
 
     def lost(self, peer: int) -> None:
@@ -134,7 +141,7 @@ class HostChoice:
 
     def _may(self, peer: int, at_ns: int, is_weak: bool) -> bool:
         told = self._told.get(peer)
-        if told is None:
+        if told is None or told.share is None:
             return is_weak
         since_s = 1e-9 * (at_ns - told.at_ns)
         was_surer = told.share < _SURER and since_s <= _REMEMBERED_S
