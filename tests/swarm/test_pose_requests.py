@@ -65,12 +65,23 @@ def test_only_who_was_surer_of_us_lately_may_know_better() -> None:
     assert not may(MAP, 36)
     choice.answered(2, 0.1, 0.2, 36 * SECOND)
     assert may(MAP, 37)
-    choice.answered(2, 0.1, math.inf, 37 * SECOND)  # than one who knew nothing: we do now
-    assert not may(MAP, 38)
-    assert choice.may_know_better(MAP, 38 * SECOND, is_weak=True)
-    choice.answered(2, 0.1, 0.2, 38 * SECOND)
+    choice.answered(2, 0.1, math.inf, 60 * SECOND)  # when we knew nothing: what was stands
+    assert may(MAP, 65)
+    assert not may(MAP, 67)
+    choice.answered(2, 0.1, 0.2, 68 * SECOND)
+    assert may(MAP, 69)
     choice.lost(2)
-    assert not may(MAP, 39)
+    assert not may(MAP, 69)
+
+
+def test_who_told_us_when_we_knew_nothing_is_not_asked_for_it_when_we_do() -> None:
+    choice = HostChoice(group_of(1))
+    choice.answered(1, 0.1, math.inf, 0)
+    assert not choice.may_know_better(MAP, SECOND, is_weak=False)
+    assert choice.may_know_better(MAP, SECOND, is_weak=True)
+    choice.answered(1, math.inf, 0.2, 2 * SECOND)
+    choice.answered(1, 0.1, math.inf, 3 * SECOND)  # it could not tell then; now it could
+    assert choice.may_know_better(MAP, 4 * SECOND, is_weak=True)
 
 
 def test_who_knows_little_asks_those_who_have_not_shown_lately_that_they_know_no_better() -> None:

@@ -54,7 +54,7 @@ def test_one_bad_frame_changes_nothing() -> None:
     assert not voted([PLENTY] * 20 + [1500, 1500] + [PLENTY] * 20)
 
 
-def test_a_hundred_looks_in_a_moment_count_as_one() -> None:
+def test_a_hundred_looks_in_a_moment_count_as_a_few() -> None:
     vote = OwnVote(OPTIONS)
     times = [0.1 * k for k in range(20)] + [1.95 + 0.001 * k for k in range(100)]
     sights = [PLENTY] * 20 + [0] * 100

@@ -260,7 +260,8 @@ class Companion:
                     return await self._localize(frame, self._maps.current or stored)
             elif not _is(self._searched, stored) or now_s >= self._search_again_at_s:
                 self._search_over.clear()
-                self._estimator.sought_since_s = now_s
+                if not _is(self._searched, stored):
+                    self._estimator.sought_since_s = asyncio.get_running_loop().time()
                 self._sought_at_ns = frame.captured_at_ns
                 may_fall_back = now_s >= self._fell_back_at_s + _FALL_BACK_EVERY_S
                 return _Sought(frame, ned_from_body, stored, may_fall_back)
@@ -292,6 +293,10 @@ class Companion:
     @property
     def _is_searching(self) -> bool:
         return not self._search_over.is_set()
+
+    def _is_behind(self, frame: Frame) -> bool:
+        """Whether a frame is later than one that is searched for."""
+        return self._is_searching and frame.captured_at_ns > self._sought_at_ns
 
     async def _search(self, sought: _Sought) -> _AskedPeers | _Sought | None:
         """Look for a frame by its features; the rest is as for any other.
@@ -359,11 +364,12 @@ class Companion:
     ) -> _Sought | _AskedPeers | None:
         """Answer a frame that has been looked at, unless peers are asked about it.
 
-        What an older frame's search leads in a moment is not asked of peers meanwhile.
+        Nor are they while the search of an older frame, which will lead this one, has only begun.
         """
         sigma_m = math.inf if refused else self._estimator.sigma_m
-        asked = None
-        if not (refused and self._estimator.is_being_sought(asyncio.get_running_loop().time())):
+        asked, now_s = None, asyncio.get_running_loop().time()
+        is_led = self._is_behind(frame) and self._estimator.is_being_sought(now_s)
+        if refused is None or not is_led:
             asked = self._inter.begin(frame, ned_from_body, stored.revision, sigma_m)
         if asked is not None:
             points_world = stored.index.landmark_map.points_world
@@ -388,7 +394,7 @@ class Companion:
 
         That is a newer map, or, where an older frame is still looked for, its place.
         """
-        if self._is_searching and frame.captured_at_ns > self._sought_at_ns:
+        if self._is_behind(frame):
             for let_go in self._behind.keep(frame, refused):
                 self._give_up(*let_go)
             return None

@@ -37,7 +37,8 @@ from vcl_companion.localization.pose_history import PoseHistory
 _MAX_CONTRADICTED = 5
 # How far back a proposal may reach; a peer that takes longer speaks of another place.
 HISTORY_S = 5.0
-# A small map is looked through in so long.
+# For so long what a frame shows counts as unknown while it is looked for by its features: a small
+# map is looked through by then.
 _SOUGHT_S = 0.5
 # A fix this old is no more where we are.
 _FRESH_NS = 2_000_000_000
@@ -90,10 +91,11 @@ class Estimator:
         """Share of the last frame that they filled; 0 when it was refused."""
         self.seen_on = b""
         """Revision of the map that the last frame was looked at on."""
-        self.sought_since_s: float | None = None
-        """Since when a frame is looked for by its features, by the loop's time; None: none is."""
         self.novelty_deg = 0.0
         """How differently they looked there from how they are remembered, degrees."""
+        self.sought_since_s: float | None = None
+        """Since when a frame is looked for by its features, by the loop's time; None where none
+        is, or where the map was looked through in vain before."""
 
     @property
     def has_heading(self) -> bool:
@@ -142,11 +144,12 @@ class Estimator:
         return Pose(pose.rotation, pose.translation + ahead_s * state.velocity_world)
 
     def is_being_sought(self, now_s: float) -> bool:
-        """Whether a frame is looked for by its features, and was not before a moment ago.
+        """Whether what the frames show will be known in a moment.
 
-        What it and those after it show is not known until then; where it takes long, it is nothing.
+        One is looked for by its features, has been for no long time, and none after it gave a pose.
         """
-        return self.sought_since_s is not None and now_s < self.sought_since_s + _SOUGHT_S
+        since_s = self.sought_since_s
+        return since_s is not None and now_s < since_s + _SOUGHT_S and not self.tracked
 
     def forget(self) -> None:
         """Know nothing of where we are any more: the next frame is looked for everywhere."""

@@ -118,16 +118,17 @@ class OwnState:
         if stored is not None and seen.seen_on != stored.revision:
             self._wants_update = self._vote.unseen()
             return self._wants_update != before
-        if seen.is_being_sought(now_s):
-            return False
-        sigma_m = seen.sigma_m if seen.tracked else None
-        self._wants_update = self._vote.look(
-            revision,
-            Sight(seen.tracked, seen.covered, sigma_m, seen.novelty_deg),
-            now_s,
-        )
-        if self._wants_update and not before:
-            self._log.event("vote", f"the map is to be updated: {', '.join(self._vote.reasons)}")
+        if stored is None or not seen.is_being_sought(now_s):
+            sigma_m = seen.sigma_m if seen.tracked else None
+            self._wants_update = self._vote.look(
+                revision,
+                Sight(seen.tracked, seen.covered, sigma_m, seen.novelty_deg),
+                now_s,
+            )
+            if self._wants_update and not before:
+                self._log.event(
+                    "vote", f"the map is to be updated: {', '.join(self._vote.reasons)}"
+                )
         self._wants_update |= self.is_asked_for_update and stored is not None
         return self._wants_update != before
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vcl_companion.geometry.camera import Camera
 from vcl_companion.mapping.culling import depth_errors, fitting
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions
@@ -57,7 +58,7 @@ def sharpened(
     images = [(k.image_bytes, k.camera) for k in landmark_map.keyframes]
     table = PatchTable(cameras, pyramids_of(images, pyramid_of))
     for rules, cauchy_px in zip(_ROUNDS, (_CAUCHY_PX, SETTLED_CAUCHY_PX), strict=True):
-        landmark_map = _round(landmark_map, table, rules, cauchy_px, options)
+        landmark_map = _round(landmark_map, table, cameras, rules, cauchy_px, options)
         if len(landmark_map.points_world) < options.min_landmarks:
             break
     return landmark_map
@@ -66,6 +67,7 @@ def sharpened(
 def _round(
     landmark_map: LandmarkMap,
     table: PatchTable,
+    cameras: list[Camera],
     rules: AlignRules,
     cauchy_px: float,
     options: MapOptions,
@@ -88,7 +90,6 @@ def _round(
     best[landmark[rising]] = rising
     kept = np.flatnonzero(best >= 0)
     kept = kept[count[best[kept]] >= 2]
-    cameras = [k.camera for k in landmark_map.keyframes]
     points, observed, cut_from = (
         landmark_map.points_world[kept],
         found[best[kept]],

@@ -1,14 +1,16 @@
-"""Patches that were found at the wrong place, by what their neighbours agree on (IV-B).
+"""Patches that were found at the wrong place, by what most of their neighbours agree on (IV-B).
 
-What repeats, as windows do, is taken for its neighbour, and then lies far behind or before what is
+What repeats, as windows do, is taken for the next one, and then lies far behind or before what is
 beside it. A few of those bend the poses until they fit them by some tenths of a pixel, for the
-farthest landmarks are what a turn is known by. So a pair's pose is found of those alone that lie
-as deep as their neighbours; the others are kept where they fit it.
+farthest landmarks are what a turn is known by. So a pair's pose is found again of those alone that
+lie as deep as their neighbours, and whatever misses its epipolar lines is told. What is wrong
+along them is not found, and bends nothing.
 """
 
 from __future__ import annotations
 
-from itertools import permutations
+from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,20 +20,24 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.tracks import ideal_of_pixels
-from vcl_companion.vision.essential import sampson_px
-from vcl_companion.vision.relative_pose import THRESHOLD_SIGMAS, relative_pose_problem
-
-Mask = NDArray[np.bool_]
+from vcl_companion.vision.acransac import THRESHOLD_SIGMAS, Mask
+from vcl_companion.vision.information import covariance_of
+from vcl_companion.vision.relative_pose import RelativePoseProblem, relative_pose_problem
 
 # Of so many neighbours half lie as deep, give or take such a part: on a slanted wall they do, and
 # beside a window taken for the next one they do not.
 _NEIGHBOURS = 30
 _LIKE = 0.3
 _SHARE = 0.5
-# Noise of patches that agree, px: where the search of it starts, whatever the camera's is.
+# Noise of patches that agree, px, at most: the search of it starts there, or with what they miss
+# the pose by that is there.
 _NOISE_PX = 0.3
-# So far from what they agree on is more than noise: sigmas, and px.
-_STRAY_SIGMAS, _STRAY_PX = 4.0, 0.3
+_NORMAL_SIGMAS = 1.4826
+# What misses by more is wrong: sigmas, of no less than so many px.
+_STRAY_SIGMAS, _LEAST_SIGMA_PX = 4.0, 0.075
+# Those that a pose was found of fit it, most of them, or it says nothing of the others.
+_FITTING = 0.5
+_SINGULAR = 1e-10
 
 
 def strays(
@@ -41,34 +47,33 @@ def strays(
     cameras: list[Camera],
     world_from_cams: list[Pose],
 ) -> Mask:
-    """Return (N, V) which patches lie aside of the epipolar line that those of a pair agree on.
+    """Return (N, V) which patches lie aside of the epipolar lines that most of a pair's lie on.
 
     Args:
         points: (N, 3) landmarks, m.
         observed_px: (N, V, 2) where their patches were found, NaN where not.
-        cut_from: (N,) the view that each patch is of.
+        cut_from: (N,) the view that each patch is of, and is found in.
         cameras: of the V views.
-        world_from_cams: likewise.
+        world_from_cams: likewise, off by no more than a few px.
     """
     ideal = ideal_of_pixels(observed_px, cameras)
     seen = np.isfinite(ideal[..., 0])
     out = np.zeros(seen.shape, dtype=np.bool_)
-    for i, k in permutations(range(len(cameras)), 2):
-        here = np.flatnonzero(seen[:, k] & (cut_from == i))
+    for i, k in combinations(range(len(cameras)), 2):
+        here = np.flatnonzero(seen[:, i] & seen[:, k] & ((cut_from == i) | (cut_from == k)))
         if len(here) <= _NEIGHBOURS:
             continue
         depth = world_from_cams[i].inverse().apply(points[here])[:, 2]
         like = _like_neighbours(observed_px[here, i], depth)
-        if like.sum() <= _NEIGHBOURS:
-            continue
-        a, b = ideal[here, i], ideal[here, k]
-        focal_px = 0.5 * (cameras[i].focal_px + cameras[k].focal_px)
         moved = world_from_cams[k].inverse() @ world_from_cams[i]
-        start = Pose(moved.rotation, moved.translation / np.linalg.norm(moved.translation))
-        problem = relative_pose_problem(a[like], b[like], focal_px)
-        agreed, sigma_px = problem.refined(start, THRESHOLD_SIGMAS * _NOISE_PX)
-        error_px = np.abs(sampson_px(agreed, a, b, focal_px))
-        out[here[error_px > max(_STRAY_SIGMAS * sigma_px, _STRAY_PX)], k] = True
+        length = float(np.linalg.norm(moved.translation))
+        if like.sum() <= _NEIGHBOURS or length == 0.0:
+            continue
+        focal_px = 0.5 * (cameras[i].focal_px + cameras[k].focal_px)
+        problem = relative_pose_problem(ideal[here, i], ideal[here, k], focal_px)
+        aside = _aside(problem, like, Pose(moved.rotation, moved.translation / length))
+        found_in = np.where(cut_from[here] == i, k, i)
+        out[here[aside], found_in[aside]] = True
     return out
 
 
@@ -78,3 +83,19 @@ def _like_neighbours(pixels: Array, depth: Array) -> Mask:
     beside = np.asarray(near)[:, 1:]
     like = np.abs(depth[beside] - depth[:, None]) < _LIKE * depth[:, None]
     return np.asarray(like.mean(axis=1) >= _SHARE)
+
+
+def _aside(problem: RelativePoseProblem, like: Mask, start: Pose) -> Mask:
+    """Return (M,) which matches miss the pose that some agree on; none where these do not."""
+    some = replace(problem, a=problem.a[like], b=problem.b[like])
+    missed_px = _NORMAL_SIGMAS * float(np.median(np.abs(some.linearized(start)[0])))
+    agreed, sigma_px = some.refined(start, THRESHOLD_SIGMAS * max(missed_px, _NOISE_PX))
+    sigma_px = max(sigma_px, _LEAST_SIGMA_PX)
+    error_px, slopes = problem.linearized(agreed)
+    fits = like & (np.abs(error_px) < _STRAY_SIGMAS * sigma_px)
+    covariance = covariance_of(problem.information(agreed, sigma_px, fits), _SINGULAR)
+    if covariance is None or fits.sum() < _FITTING * like.sum():
+        return np.zeros(len(like), dtype=np.bool_)
+    # Far from those that it was found of a pose's lines are known less well.
+    variance = sigma_px**2 + np.einsum("ni,ij,nj->n", slopes, covariance, slopes)
+    return np.asarray(error_px**2 > _STRAY_SIGMAS**2 * variance)

@@ -17,7 +17,7 @@ class InterMavOptions(InterOptions):
     Attributes:
         every_n_frames: localized frames from one request to the next, by the default
             pipeline only while a peer may know better; a frame that is refused asks
-            anyway. 0: never asks, still answers.
+            anyway, unless an older one's search has only begun. 0: never asks, still answers.
         least_interval_s: localized frames ask no more often, however many there are, nor
             do refused ones when nobody could answer the last time: looking costs each
             host a fifth of a second of one core.
@@ -72,7 +72,7 @@ _SURER = 0.8
 class _Answer:
     """How sure a peer's last answer was: its position's 1 sigma, m, and as a share of our own.
 
-    None for that where we knew nothing: it says of those who know something only how sure it was.
+    None for that where we knew nothing, and had not known anything lately either.
     """
 
     sigma_m: float
@@ -113,8 +113,9 @@ class HostChoice:
         Args:
             revision: of our map.
             at_ns: now, in the time of ``answered``.
-            is_weak: whether we know little: then whoever has not been asked lately may. Else
-                only those who were surer lately than we were then.
+            is_weak: whether we know little: then whoever has not been asked lately may, and who
+                was only when we knew nothing. Else only those who were surer lately than we were
+                then.
         """
         return any(self._may(peer, at_ns, is_weak) for peer in self._able(revision))
 
@@ -127,11 +128,15 @@ class HostChoice:
             own_sigma_m: what we knew ourselves; infinite for nothing.
             at_ns: when.
         """
-        share = None
+        former = self._told.get(peer)
+        share: float | None = None
         if math.isinf(sigma_m):
             share = math.inf
         elif math.isfinite(own_sigma_m):
             share = sigma_m / own_sigma_m
+        elif former is not None and former.share is not None and math.isfinite(former.share):
+            # Than nothing everybody knows more: what it was when we knew something stands.
+            share, at_ns = former.share, former.at_ns
         self._told[peer] = _Answer(sigma_m, share, at_ns)
 
     def lost(self, peer: int) -> None:

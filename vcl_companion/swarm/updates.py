@@ -34,8 +34,8 @@ from vcl_companion.swarm.group import Group
 
 # One bad frame is no reason to vote: a vote is about the median of so long, s.
 _WINDOW_S = 1.0
-# Looks that come sooner after each other are one: the window's median is of its time, and who is
-# told much at a time would look a hundred times at one frame.
+# Looks that come sooner after each other are one: who is told much at a time would look a hundred
+# times at one frame, and these would outvote all others of the window.
 _LOOKS_APART_S = 0.04
 # A new map is not judged by less than this share of the window, nor where it leads by less
 # than nearly all of it.

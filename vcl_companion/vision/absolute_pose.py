@@ -10,6 +10,7 @@ import numpy as np
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, orthonormalized
 from vcl_companion.vision.acransac import (
+    THRESHOLD_SIGMAS,
     AcRansacOptions,
     Consensus,
     Indices,
@@ -111,7 +112,7 @@ class ResectionProblem:
         moved, sigma = _refined(
             np.ascontiguousarray(model), self.ideal, self.points, self.focal_px,
             self.error == "angle",
-            threshold_px / 2.5, np.exp(self.log_alpha), rounds,
+            threshold_px / THRESHOLD_SIGMAS, np.exp(self.log_alpha), rounds,
         )  # fmt: skip
         return moved, sigma
 

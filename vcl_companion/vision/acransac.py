@@ -37,6 +37,8 @@ _LOG_EDGES = np.log(
         np.float64
     )
 )
+THRESHOLD_SIGMAS = 2.5
+"""What a threshold found from the data is taken for, in sigmas of the noise behind it."""
 _MODELS_PER_BATCH = 64
 _MAX_REFITS = 4
 # One of so many samples is drawn among the inliers of the best model.

@@ -13,7 +13,7 @@ import numpy as np
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, orthonormalized
-from vcl_companion.vision.acransac import Indices
+from vcl_companion.vision.acransac import THRESHOLD_SIGMAS, Indices
 from vcl_companion.vision.compiled import compiled
 
 
@@ -55,7 +55,8 @@ class HomographyProblem:
 
     def refit(self, model: Array, threshold: float) -> Array:
         """Return the homography with the least weighted transfer error."""
-        return _refined_homography(model, self.a, self.b, self.focal_px, threshold / 2.5, 5)
+        sigma_px = threshold / THRESHOLD_SIGMAS
+        return _refined_homography(model, self.a, self.b, self.focal_px, sigma_px, 5)
 
 
 def poses_of_homography(homography: Array) -> list[Pose]:

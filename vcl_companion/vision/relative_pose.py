@@ -14,6 +14,7 @@ import numpy as np
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, log_so3, skew
 from vcl_companion.vision.acransac import (
+    THRESHOLD_SIGMAS,
     AcRansacOptions,
     Consensus,
     Indices,
@@ -38,8 +39,6 @@ _ROUNDS_OF_A_REFIT = 6
 # Poses with this share of the best one's inliers in front of both cameras are judged as well.
 _CHEIRALITY_TIE = 0.5
 _SURE_SIGMAS = 3.0
-THRESHOLD_SIGMAS = 2.5
-"""What a threshold found from the data is taken for, in sigmas of the noise behind it."""
 # One hypothesis found twice, whatever the noise.
 _SAME_TURN_RAD = np.deg2rad(0.3)
 _SAME_DIRECTION_RAD = np.deg2rad(1.5)
@@ -140,12 +139,17 @@ class RelativePoseProblem:
         The turn is a rotation vector on the right, the direction's error lies along
         ``tangent(pose.translation)``.
         """
+        _, slopes = self.linearized(pose)
+        return np.asarray(slopes[inliers].T @ slopes[inliers] / sigma_px**2)
+
+    def linearized(self, pose: Pose) -> tuple[Array, Array]:
+        """Return (N,) signed Sampson distances, px, and their (N, 5) slopes; see above."""
         residual, slopes = np.empty(self.n_data), np.empty((self.n_data, 5))
         rotation = np.array(pose.rotation, order="C")
         linearize(
             rotation, pose.translation.copy(), self.a, self.b, self.focal_px, residual, slopes
         )
-        return np.asarray(slopes[inliers].T @ slopes[inliers] / sigma_px**2)
+        return residual, slopes
 
 
 def essential_candidates(
@@ -193,7 +197,13 @@ def essential_candidates(
 
 
 def relative_pose_problem(ideal_a: Array, ideal_b: Array, focal_px: float) -> RelativePoseProblem:
-    """Return what ``ac_ransac`` searches: (M, 2) ideal image coordinates, px per ideal unit."""
+    """Return the problem of (M, 2) ideal image coordinates in each of two cameras.
+
+    Args:
+        ideal_a: in camera a, finite.
+        ideal_b: the same places in camera b.
+        focal_px: px per ideal unit.
+    """
     # A kernel is compiled once more for arrays that may not be written, and for integers.
     focal_px = float(focal_px)
     a, b = (np.array(side, dtype=np.float64, order="C") for side in (ideal_a, ideal_b))
