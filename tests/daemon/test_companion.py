@@ -19,7 +19,7 @@ import numpy as np
 from sitl.frame_server import FrameServer
 from tests.daemon import demo
 from tests.daemon.autopilot import Autopilot, autopilot_and_link
-from tests.daemon.waiting import beside, run, until
+from tests.daemon.waiting import beside, hurry, run, until
 from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import ManualClock
 from vcl_companion.daemon.companion import Companion
@@ -42,6 +42,8 @@ from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
+from vcl_companion.wire.map_codec import revision_of
+from vcl_companion.wire.messages import MapState
 
 DRONE = 2
 FRAMES_ALONE = AutopilotOptions(min_rate_hz=0.0)
@@ -64,6 +66,7 @@ class Flight:
     log: FlightLog
     path: Path
     shop: Shop
+    asked: list[int]
 
     def give(self, k: int, sequence: int | None = None, north_turned_rad: float = 0.0) -> None:
         """Hand out the k-th picture, and its attitude before it."""
@@ -126,12 +129,23 @@ class Shop(Workshop):
         return super().find(*asked)
 
 
-def nobody_to_ask(work: MapWork, clock: ManualClock) -> InterTarget:
-    """The target's side of inter-MAV localization of a drone alone."""
-    alone = HostChoice(Group(SwarmOptions(), DRONE))
+def target_of(
+    peers: tuple[int, ...], asked: list[int], work: MapWork, clock: ManualClock, us: Estimator
+) -> InterTarget:
+    """The target's side of inter-MAV localization, with peers on the map who never answer."""
+    group = Group(SwarmOptions((*peers, DRONE)), DRONE)
+    well = MapState(revision_of(demo.encoded_map(1, 2, 3)), 100, True)
+    group.set_own_state(well)
+    for peer in peers:
+        group.map_state(peer, well, 0.0)
+
+    def hand(peer: int, _: bytes) -> int:
+        asked.append(peer)
+        return 0
+
     return InterTarget(
-        DRONE, alone, demo.sensor(DRONE), clock, work, lambda _, __: 0, lambda _: None,
-        lambda _, attitude: (attitude, True), lambda _: 0.1, lambda _, __: None,
+        DRONE, HostChoice(group), demo.sensor(DRONE), clock, work, hand, lambda _: None,
+        us.for_peers, lambda _: 0.1, lambda _, __: None,
         InterMavOptions(), np.random.default_rng(0), only_the_surer=True,
     )  # fmt: skip
 
@@ -142,6 +156,7 @@ async def flight(
     frame_wait_s: float = 0.1,
     coast_s: float = 0.0,
     rates: AutopilotOptions = FRAMES_ALONE,
+    peers: tuple[int, ...] = (),
 ) -> AsyncIterator[Flight]:
     """A companion with everything around it; its own two coroutines do not run yet."""
     first = demo.shot(DRONE)
@@ -168,9 +183,11 @@ async def flight(
         motion = FilterOptions(coast_s=coast_s)
         estimator = Estimator(motion, OPTIONS.localization, lambda _: None)
         teller = Teller(link, estimator, clock, log, rates)
+        asked: list[int] = []
         companion = Companion(
-            camera, outcomes, sensor, link, teller, maps, estimator, nobody_to_ask(work, clock),
-            history.add, health, log, executor, work, OPTIONS, frame_wait_s,
+            camera, outcomes, sensor, link, teller, maps, estimator,
+            target_of(peers, asked, work, clock, estimator), history.add, health, log, executor,
+            work, OPTIONS, frame_wait_s,
         )  # fmt: skip
         await stack.enter_async_context(beside(link.run()))
         assert await link.attitudes.at(first.at_ns, 5.0) is not None
@@ -187,6 +204,7 @@ async def flight(
             log,
             path / "log",
             shop,
+            asked,
         )
 
 
@@ -196,10 +214,11 @@ async def flying(
     frame_wait_s: float = 0.1,
     coast_s: float = 0.0,
     rates: AutopilotOptions = FRAMES_ALONE,
+    peers: tuple[int, ...] = (),
 ) -> AsyncIterator[Flight]:
     """The same, in flight."""
     async with (
-        flight(path, frame_wait_s, coast_s, rates) as up,
+        flight(path, frame_wait_s, coast_s, rates, peers) as up,
         beside(up.companion.read_camera(), up.companion.run()),
     ):
         await up.server.connected()
@@ -403,6 +422,25 @@ def test_a_frame_that_is_looked_for_leads_those_that_came_meanwhile(tmp_path: Pa
             up.give(4)
             await up.server.answered()
             assert up.frames()[-1] == (4, "localized", None)
+
+    run(scenario())
+
+
+def test_peers_are_asked_where_a_search_takes_long_and_not_before(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path, peers=(1,)) as up:
+            up.fly_on_a_map()
+            up.shop.is_open.clear()
+            for k, shot in enumerate(demo.shot(DRONE, k) for k in range(3)):
+                up.give(k)
+                await until(partial(up.estimator.has_looked_at, shot.at_ns))
+            assert up.asked == []
+            hurry(0.6)
+            up.give(3)
+            await until(lambda: up.asked == [1])
+            up.shop.is_open.set()
+            await up.server.answered()
+            assert [up.server.outcomes[k] for k in (0, 1, 3)] == ["localized"] * 3
 
     run(scenario())
 
