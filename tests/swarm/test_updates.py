@@ -308,8 +308,25 @@ def test_more_than_half_decide(n_members: int, n_blind: int, begins: bool) -> No
         assert 10.0 + OPTIONS.hold_s < at_s < 13.0
 
 
+def test_a_vote_stands_for_half_a_second_after_its_reason() -> None:
+    vote = OwnVote(OPTIONS)
+    wide, narrow = (Sight(PLENTY, OPTIONS.covered + d) for d in (0.2, -0.05))
+    sights = [wide] * 20 + [narrow] * 10 + [wide] * 20
+    votes = [vote.look(FIRST, sight, k * STEP_S) for k, sight in enumerate(sights)]
+    begins, ends = votes.index(True), len(votes) - votes[::-1].index(True)
+    assert all(votes[begins:ends])
+    # By the window's median it begins and ends half a second late, and then it stands.
+    assert 25 <= begins <= 26
+    assert 39 <= ends <= 41
+    # What hovers about a bound is one vote, though the reason comes and goes.
+    sights = [wide] * 20 + ([narrow] * 7 + [wide] * 5) * 6
+    vote = OwnVote(OPTIONS)
+    votes = [vote.look(FIRST, sight, k * STEP_S) for k, sight in enumerate(sights)]
+    assert all(votes[votes.index(True) :])
+
+
 def test_a_majority_for_a_moment_is_none() -> None:
-    sky = Sky((1, 2, 3))
+    sky = Sky((1, 2, 3), options=replace(OPTIONS, hold_s=1.5))
     sky.run(10.0)
     for _ in range(20):
         sky.see(FEW, 2, 3)

@@ -18,8 +18,9 @@ as long from now as the last update took, from the majority's wish to the map):
   revision): what is known no better than that only gets worse, and is
   inherited by whatever is added to the map later.
 
-When the majority of the members alive votes so, the coordinator makes one. A
-drone alone is the majority.
+A vote stands for half a second after its reason, so that those of a majority meet. When the
+majority of the members alive votes so, the coordinator makes one. A drone alone is the
+majority.
 """
 
 from __future__ import annotations
@@ -37,6 +38,9 @@ _WINDOW_S = 1.0
 # Looks that come sooner after each other are one: who is told much at a time would look a hundred
 # times at one frame, and these would outvote all others of the window.
 _LOOKS_APART_S = 0.04
+# What is seen hovers about the bounds: a vote stands for so long after its reason, or those of a
+# majority hardly meet.
+_STANDS_S = 0.5
 # A new map is not judged by less than this share of the window, nor where it leads by less
 # than nearly all of it.
 _JUDGED_SHARE = 0.5
@@ -190,6 +194,7 @@ class OwnVote:
         self._most_covered = 0.0
         self._least_sigma_m = math.inf
         self.reasons: tuple[str, ...] = ()
+        self._had_reason_s = -math.inf
         self._used = b""
         self._wanted_since_s: float | None = None
         self._took_s = 0.0
@@ -246,10 +251,14 @@ class OwnVote:
                 "little of the image": self._is_narrow(),
                 "vague position": self._is_vague(),
             }
-            self.reasons = tuple(reason for reason, holds in judged.items() if holds)
+            reasons = tuple(reason for reason, holds in judged.items() if holds)
             # May look all over the map: not asked where there is a reason already.
-            if not self.reasons and self._is_new():
-                self.reasons = ("new view",)
+            if not reasons and self._is_new():
+                reasons = ("new view",)
+            if reasons:
+                self.reasons, self._had_reason_s = reasons, now_s
+            elif now_s >= self._had_reason_s + _STANDS_S:
+                self.reasons = ()
         return bool(self.reasons)
 
     def unseen(self) -> bool:
