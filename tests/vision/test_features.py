@@ -1,12 +1,9 @@
-import os
-
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision import features as module
 from vcl_companion.vision.features import Detector, FeatureOptions, Features, Image, detect
 
 DETECTORS: tuple[Detector, ...] = ("akaze", "sift", "orb")
@@ -54,15 +51,6 @@ def test_a_blob_is_found_where_it_is(detector: Detector, sizes: tuple[float, flo
     np.testing.assert_allclose(np.median(error, axis=0), 0.0, atol=0.02)
     np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=0.05)
     assert 1e-4 < error.std() < 0.06
-
-
-def test_a_process_that_is_forked_off_a_search_can_search() -> None:
-    with module._one_at_a_time:
-        pid = os.fork()
-        if pid == 0:
-            os._exit(0 if module._one_at_a_time.acquire(timeout=2.0) else 1)
-    _, status = os.waitpid(pid, 0)
-    assert os.waitstatus_to_exitcode(status) == 0
 
 
 @every_detector

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,16 +22,6 @@ _MIN_SIDE_PX = 32
 
 # For a moment AKAZE takes 30 MB for an image of 640 x 480: one thread after the other.
 _one_at_a_time = threading.Lock()
-
-
-def _renew_lock() -> None:
-    global _one_at_a_time
-    _one_at_a_time = threading.Lock()
-
-
-# A forked process has none of the other threads: who holds the lock is not there to let it go.
-os.register_at_fork(after_in_child=_renew_lock)
-
 # SIFT takes 200 bytes a pixel, so it looks at tiles: of about this size, cut at a multiple of what
 # its coarser octaves leave out, with so much of the image around each as all but one in a hundred
 # features of a sharp image reach (coarser ones near a cut are a little displaced, or missing).
