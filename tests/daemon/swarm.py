@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,6 +16,7 @@ from tests.daemon import demo
 from tests.daemon.autopilot import Autopilot, autopilot_and_link
 from tests.daemon.waiting import beside, until
 from tests.ports import free_ports
+from tests.whole_lines import json_lines
 from vcl_companion.cameras.source import Frame
 from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import ManualClock
@@ -188,10 +188,15 @@ class Drone:
         """Of the map it flies on; empty without one."""
         return b"" if self.maps.current is None else self.maps.current.revision
 
+    @property
+    def wants_update(self) -> bool:
+        """Whether it has told that it votes for an update."""
+        state = self.group.state_of(self.system_id)
+        return state is not None and state.wants_update
+
     def lines(self, kind: str) -> list[dict[str, Any]]:
         """What its log says of one kind so far."""
-        records = map(json.loads, self._log_path.read_text().splitlines())
-        return [record for record in records if record["kind"] == kind]
+        return [record for record in json_lines(self._log_path) if record["kind"] == kind]
 
     def events(self, event: str) -> list[str]:
         """The reasons of the events of one name so far."""

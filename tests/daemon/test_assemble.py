@@ -20,6 +20,7 @@ import pytest
 from sitl.daemon_config import toml_text
 from tests.daemon import demo
 from tests.ports import free_ports
+from tests.whole_lines import json_lines
 from vcl_companion.recording import Description, RecordingWriter
 from vcl_companion.wire.map_codec import revision_of
 from vcl_companion.wire.warm_up import warm_up
@@ -69,8 +70,7 @@ class Daemon:
         return self.process.returncode, errors
 
     def lines(self, kind: str) -> list[dict[str, Any]]:
-        lines = map(json.loads, self.log.read_text().splitlines())
-        return [line for line in lines if line["kind"] == kind]
+        return [line for line in json_lines(self.log) if line["kind"] == kind]
 
     def assert_log_is_complete(self) -> dict[str, Any]:
         """Every frame that was read has its line, and the summary is the last one."""

@@ -10,11 +10,6 @@ from vcl_companion.swarm.updates import UpdateOptions
 PLENTY = 500
 
 
-def wants(drone: Drone) -> bool:
-    state = drone.group.state_of(1)
-    return state is not None and state.wants_update
-
-
 def seek(drone: Drone) -> None:
     """Have the drone refuse a frame by its patches, and look for it by its features."""
     drone.track(0)
@@ -37,7 +32,7 @@ def test_a_frame_that_is_found_by_its_features_a_moment_later_is_no_reason(tmp_p
                 await passes(0.25)
             find(one)
             await passes(1.0)
-            assert not wants(one)
+            assert not one.wants_update
             assert one.events("vote") == []
 
     run(scenario())
@@ -49,8 +44,8 @@ def test_a_frame_that_is_long_looked_for_shows_nothing(tmp_path: Path) -> None:
             one = await members.start(1, flies_on=(1, 2), update=UpdateOptions())
             find(one)
             await passes(2.0)
-            assert not wants(one)
+            assert not one.wants_update
             seek(one)
-            await passes_until(lambda: wants(one), at_most_s=2.0)
+            await passes_until(lambda: one.wants_update, at_most_s=2.0)
 
     run(scenario())

@@ -102,16 +102,12 @@ def test_a_drone_votes_by_what_was_set(tmp_path: Path) -> None:
             await one.see(demo.frame(1, 12))
             one.track(400)
             await passes(3.0)
-            assert not wants(one)
+            assert not one.wants_update
             assert await set_to(one, "VCL_UPD_TRACKED", 500.0) == 500.0
-            await passes_until(lambda: wants(one))
+            await passes_until(lambda: one.wants_update)
             assert await set_to(one, "VCL_UPD_TRACKED", 99.5) == 500.0
             assert await set_to(one, "VCL_UPD_TRACKED", 0.0) == 0.0
-            await passes_until(lambda: not wants(one))
-
-    def wants(drone: Drone) -> bool:
-        state = drone.group.state_of(1)
-        return state is not None and state.wants_update
+            await passes_until(lambda: not one.wants_update)
 
     run(scenario())
 

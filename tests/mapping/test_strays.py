@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
@@ -35,6 +36,11 @@ class Facade:
         self.cams = [Pose.identity(), bent]
         self.is_wrong = np.arange(n) >= WALL + NEAR
 
+    def strays(self, cut_from: int = 0) -> NDArray[np.bool_]:
+        """Which patches of one of the views stray, found in both."""
+        reference = np.full(len(self.points), cut_from, dtype=np.intp)
+        return strays(self.points, self.observed_px, reference, [CAMERA] * 2, self.cams)
+
 
 @pytest.mark.parametrize("noise_px", [0.03, 0.1, 0.2])
 @pytest.mark.parametrize("cut_from", [0, 1])
@@ -42,9 +48,8 @@ def test_what_lies_behind_its_neighbours_and_aside_of_their_lines_is_found(
     noise_px: float, cut_from: int
 ) -> None:
     scene = Facade(noise_px)
-    reference = np.full(len(scene.points), cut_from, dtype=np.intp)
 
-    found = strays(scene.points, scene.observed_px, reference, [CAMERA] * 2, scene.cams)
+    found = scene.strays(cut_from)
 
     assert not found[:, cut_from].any()
     other = found[:, 1 - cut_from]
@@ -55,9 +60,8 @@ def test_what_lies_behind_its_neighbours_and_aside_of_their_lines_is_found(
 @pytest.mark.parametrize("bent_deg", [0.0, 0.1, 0.5])
 def test_poses_that_are_some_pixels_off_let_nothing_good_be_lost(bent_deg: float) -> None:
     scene = Facade(0.05, bent_deg)
-    reference = np.zeros(len(scene.points), dtype=np.intp)
 
-    found = strays(scene.points, scene.observed_px, reference, [CAMERA] * 2, scene.cams)[:, 1]
+    found = scene.strays()[:, 1]
 
     assert found[scene.is_wrong].all()
     assert found[~scene.is_wrong].mean() < 0.01
@@ -68,29 +72,22 @@ def test_what_stands_before_a_wall_stays_for_it_fits_the_pose(noise_px: float) -
     lost = []
     for seed in range(10):
         scene = Facade(noise_px, seed=seed)
-        reference = np.zeros(len(scene.points), dtype=np.intp)
-        found = strays(scene.points, scene.observed_px, reference, [CAMERA] * 2, scene.cams)
-        lost.append(found[WALL : WALL + NEAR].mean())
+        lost.append(scene.strays()[WALL : WALL + NEAR].mean())
     assert max(lost) <= 0.1, lost
 
 
 def test_a_wall_in_a_corner_says_little_of_the_rest() -> None:
-    scene = Facade(0.2)
-    pixels, rng = scene.observed_px[:, 0], np.random.default_rng(2)
-    corner = (pixels < (200.0, 150.0)).all(axis=1)
-    kept = ~scene.is_wrong
+    scene, rng = Facade(0.2), np.random.default_rng(2)
+    pixels = scene.observed_px[:, 0]
     # Elsewhere everything is rough: no landmark is as deep as those beside it.
-    there = scene.cams[1]
-    scale = np.where(corner, 1.0, np.exp(rng.uniform(-1.0, 1.0, len(pixels))))
-    points = scene.points * scale[:, None]
+    corner = (pixels < (200.0, 150.0)).all(axis=1)
+    scene.points *= np.where(corner, 1.0, np.exp(rng.uniform(-1.0, 1.0, len(pixels))))[:, None]
     straight = Facade(0.2, bent_deg=0.0).cams[1]
-    seen = CAMERA.project(straight.inverse().apply(points)) + rng.normal(0.0, 0.2, pixels.shape)
-    observed = np.stack([pixels, seen], axis=1)[kept]
+    seen = CAMERA.project(straight.inverse().apply(scene.points))
+    scene.observed_px[:, 1] = seen + rng.normal(0.0, 0.2, pixels.shape)
+    scene.observed_px[scene.is_wrong] = np.nan
 
-    reference = np.zeros(len(observed), dtype=np.intp)
-    found = strays(points[kept], observed, reference, [CAMERA] * 2, [scene.cams[0], there])
-
-    assert found.mean() < 0.02
+    assert scene.strays()[~scene.is_wrong].mean() < 0.02
 
 
 def test_of_three_views_the_one_that_was_found_wrong_is_told() -> None:
@@ -110,22 +107,14 @@ def test_of_three_views_the_one_that_was_found_wrong_is_told() -> None:
 
 def test_views_from_one_place_have_no_lines() -> None:
     scene = Facade(0.05)
-    reference = np.zeros(len(scene.points), dtype=np.intp)
-    turned = Pose(scene.cams[1].rotation, scene.cams[0].translation)
+    scene.cams[1] = Pose(scene.cams[1].rotation, scene.cams[0].translation)
 
-    found = strays(
-        scene.points, scene.observed_px, reference, [CAMERA] * 2, [scene.cams[0], turned]
-    )
-
-    assert not found.any()
+    assert not scene.strays().any()
 
 
 def test_a_view_that_finds_little_is_left_alone() -> None:
     scene = Facade(0.05)
     few = np.arange(len(scene.points)) >= len(scene.points) - 30
-    observed = np.where(few[:, None, None], scene.observed_px, np.nan)
+    scene.observed_px = np.where(few[:, None, None], scene.observed_px, np.nan)
 
-    reference = np.zeros(len(scene.points), dtype=np.intp)
-    found = strays(scene.points, observed, reference, [CAMERA] * 2, scene.cams)
-
-    assert not found.any()
+    assert not scene.strays().any()

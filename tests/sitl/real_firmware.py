@@ -21,6 +21,7 @@ from sitl.autopilots.motion import RecordedMotion
 from sitl.autopilots.px4_parameters import RECORDED as PX4_RECORDED
 from sitl.autopilots.steered import open_udp
 from sitl.firmware import parse_firmware
+from tests.whole_lines import whole_lines
 from vcl_companion.clock import ManualClock
 from vcl_companion.daemon.resets import Resets
 from vcl_companion.geometry.pose import Pose
@@ -156,7 +157,7 @@ class Flight:
 
     def off_m(self, fused: Path) -> Array:
         """Return (3,) how far from the truth it last said to be."""
-        at_ns, *values = fused.read_text().splitlines()[-1].split(",")
+        at_ns, *values = whole_lines(fused)[-1].split(",")
         return np.asarray(np.array([float(value) for value in values]) - self.true_at(int(at_ns)))
 
     def behind_s(self, fused: Path) -> float:
@@ -183,7 +184,7 @@ class Flight:
         return times, np.asarray(np.linalg.norm(apart, axis=1))
 
     def _lately(self, fused: Path) -> tuple[NDArray[np.int64], Array]:
-        rows = [line.split(",") for line in fused.read_text().splitlines()[-60:]]
+        rows = [line.split(",") for line in whole_lines(fused)[-60:]]
         times = np.array([int(row[0]) for row in rows])
         believed = np.array([[float(value) for value in row[1:]] for row in rows])
         lately = times > self.clock.now_ns() - 1_000_000_000

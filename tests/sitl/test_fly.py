@@ -20,6 +20,7 @@ import pytest
 from click.testing import CliRunner
 
 from sitl.__main__ import main
+from tests.whole_lines import json_lines
 from vcl_companion.recording import Description, RecordingWriter, read_recording
 from vcl_companion.recording.tum import read_tum
 
@@ -81,7 +82,7 @@ def report_in(out: Path) -> dict[str, Any]:
 
 def poses_received(out: Path, drone: str) -> list[dict[str, Any]]:
     """Return the fields of every VISION_POSITION_ESTIMATE an autopilot heard."""
-    lines = map(json.loads, (out / drone / "received.jsonl").read_text().splitlines())
+    lines = json_lines(out / drone / "received.jsonl")
     return [line["fields"] for line in lines if line["type"] == "VISION_POSITION_ESTIMATE"]
 
 

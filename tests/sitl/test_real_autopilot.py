@@ -31,6 +31,7 @@ from tests.sitl.real_firmware import (
     Real,
     flown,
 )
+from tests.whole_lines import whole_lines
 from vcl_companion.daemon.parameter_rules import findings, names_of, rules_for
 from vcl_companion.daemon.resets import Resets
 from vcl_companion.geometry.pose import Pose
@@ -196,9 +197,7 @@ def test_told_its_origin_before_poses_it_knows_its_global_position_by_them(tmp_p
         await flight.fly(25.0)
         assert flight.states == [FusionState.FUSED]
         assert flight.apart_m(fused).max() < 0.1
-        at_ns, latitude, longitude, altitude = map(
-            float, places.read_text().splitlines()[-1].split(",")
-        )
+        at_ns, latitude, longitude, altitude = map(float, whole_lines(places)[-1].split(","))
         there = flight.true_at(round(at_ns)) + flight.origin_world
         metres_per_deg = 111_318.845  # by LOCATION_SCALING_FACTOR
         off_m = [

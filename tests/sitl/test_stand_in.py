@@ -18,6 +18,7 @@ from mavsdk.plugins.mavlink_direct import MavlinkDirect
 from sitl.autopilots.attitude_source import AttitudeErrors, ReplayedAttitude, TruthAttitude
 from tests.daemon.waiting import until
 from tests.links.running import LONGEST_S, running, udp
+from tests.whole_lines import json_lines
 from vcl_companion.clock import ManualClock
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.pose import Pose, euler_pose_covariance
@@ -125,8 +126,7 @@ def truth(tmp_path: Path, **settings: object) -> dict[str, object]:
 
 
 def received(out: Path, kind: str) -> list[dict[str, Any]]:
-    lines = [json.loads(line) for line in (out / "received.jsonl").read_text().splitlines()]
-    return [line for line in lines if line["type"] == kind]
+    return [line for line in json_lines(out / "received.jsonl") if line["type"] == kind]
 
 
 def attitude_rows(out: Path) -> tuple[list[int], Array]:

@@ -367,9 +367,11 @@ class Companion:
         Nor are they while the search of an older frame, which will lead this one, has only begun.
         """
         sigma_m = math.inf if refused else self._estimator.sigma_m
-        asked, now_s = None, asyncio.get_running_loop().time()
-        is_led = self._is_behind(frame) and self._estimator.is_being_sought(now_s)
-        if refused is None or not is_led:
+        now_s = asyncio.get_running_loop().time()
+        is_sought = self._estimator.is_being_sought(now_s)
+        is_led = refused is not None and self._is_behind(frame) and is_sought
+        asked = None
+        if not is_led:
             asked = self._inter.begin(frame, ned_from_body, stored.revision, sigma_m)
         if asked is not None:
             points_world = stored.index.landmark_map.points_world

@@ -28,6 +28,7 @@ from vcl_companion.vision.essential import (
     RelativePose,
     relative_poses,
 )
+from vcl_companion.vision.information import robust_sigma
 from vcl_companion.vision.matching import MatchOptions, match_guided, match_mutual
 from vcl_companion.vision.triangulation import triangulate
 
@@ -231,7 +232,7 @@ def _scaled(hypothesis: RelativePose, pair: PairEvidence) -> Pose | NoProposal:
     if len(log_ratio) < pair.options.min_common:
         return _too_few(len(log_ratio), pair.options)
     middle = float(np.median(log_ratio))
-    spread = 1.4826 * float(np.median(np.abs(log_ratio - middle)))
+    spread = robust_sigma(log_ratio - middle)
     if spread > pair.options.max_scale_spread:
         return NoProposal(
             f"the scale varies by {100 * spread:.0f} % over the common landmarks, "

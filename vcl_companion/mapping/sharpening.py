@@ -89,18 +89,11 @@ def _round(
     rising = np.argsort(count, kind="stable")
     best[landmark[rising]] = rising
     kept = np.flatnonzero(best >= 0)
-    kept = kept[count[best[kept]] >= 2]
-    points, observed, cut_from = (
-        landmark_map.points_world[kept],
-        found[best[kept]],
-        view[best[kept]],
-    )
-    observed[strays(points, observed, cut_from, cameras, cams)] = np.nan
-    still = np.isfinite(observed[:, :, 0]).sum(axis=1) >= 2
+    points, observed = landmark_map.points_world[kept], found[best[kept]]
+    observed[strays(points, observed, view[best[kept]], cameras, cams)] = np.nan
+    seen_twice = np.isfinite(observed[:, :, 0]).sum(axis=1) >= 2
     measured = replace(
-        landmark_map,
-        points_world=points[still],
-        observed_px=observed[still],
+        landmark_map, points_world=points[seen_twice], observed_px=observed[seen_twice]
     )
     if len(measured.points_world) < options.min_landmarks:
         return measured

@@ -21,7 +21,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.tracks import ideal_of_pixels
 from vcl_companion.vision.acransac import THRESHOLD_SIGMAS, Mask
-from vcl_companion.vision.information import covariance_of
+from vcl_companion.vision.information import covariance_of, robust_sigma
 from vcl_companion.vision.relative_pose import RelativePoseProblem, relative_pose_problem
 
 # Of so many neighbours half lie as deep, give or take such a part: on a slanted wall they do, and
@@ -32,7 +32,6 @@ _SHARE = 0.5
 # Noise of patches that agree, px, at most: the search of it starts there, or with what they miss
 # the pose by that is there.
 _NOISE_PX = 0.3
-_NORMAL_SIGMAS = 1.4826
 # What misses by more is wrong: sigmas, of no less than so many px.
 _STRAY_SIGMAS, _LEAST_SIGMA_PX = 4.0, 0.075
 # Those that a pose was found of fit it, most of them, or it says nothing of the others.
@@ -88,8 +87,9 @@ def _like_neighbours(pixels: Array, depth: Array) -> Mask:
 def _aside(problem: RelativePoseProblem, like: Mask, start: Pose) -> Mask:
     """Return (M,) which matches miss the pose that some agree on; none where these do not."""
     some = replace(problem, a=problem.a[like], b=problem.b[like])
-    missed_px = _NORMAL_SIGMAS * float(np.median(np.abs(some.linearized(start)[0])))
-    agreed, sigma_px = some.refined(start, THRESHOLD_SIGMAS * max(missed_px, _NOISE_PX))
+    missed_px, _ = some.linearized(start)
+    noise_px = max(robust_sigma(missed_px), _NOISE_PX)
+    agreed, sigma_px = some.refined(start, THRESHOLD_SIGMAS * noise_px)
     sigma_px = max(sigma_px, _LEAST_SIGMA_PX)
     error_px, slopes = problem.linearized(agreed)
     fits = like & (np.abs(error_px) < _STRAY_SIGMAS * sigma_px)

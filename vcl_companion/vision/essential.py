@@ -15,6 +15,7 @@ import numpy as np
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, skew
 from vcl_companion.vision.acransac import AcRansacOptions
+from vcl_companion.vision.information import robust_sigma
 from vcl_companion.vision.relative_pose import essential_candidates
 from vcl_companion.vision.triangulation import triangulate
 
@@ -121,7 +122,7 @@ def _translation_only(a: Array, b: Array, rotation: Array) -> Pose:
         _, vectors = np.linalg.eigh((normals * weight[:, None]).T @ normals)
         direction = vectors[:, 0]
         error = normals @ direction
-        scale = max(1.4826 * float(np.median(np.abs(error))), 1e-6)
+        scale = max(robust_sigma(error), 1e-6)
         weight = 1.0 / (1.0 + (error / (2.0 * scale)) ** 2)
     forward = Pose(rotation, direction)
     backward = Pose(rotation, -direction)

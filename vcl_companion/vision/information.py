@@ -1,4 +1,7 @@
-"""From a normal matrix to a covariance, or to the statement that there is none (eq. 12)."""
+"""From a normal matrix to a covariance, or to the statement that there is none (eq. 12).
+
+And from errors to their noise.
+"""
 
 from __future__ import annotations
 
@@ -29,6 +32,11 @@ def covariance_of(information: Array, least_eigenvalue: float) -> Array | None:
             return None
         out = np.linalg.inv(unit) / scale
     return np.asarray(0.5 * (out + np.swapaxes(out, -1, -2)))
+
+
+def robust_sigma(errors: Array) -> float:
+    """Return the 1 sigma of normal errors, (N,), of which less than half may be wrong."""
+    return 1.4826 * float(np.median(np.abs(errors)))
 
 
 def squared_distances(apart: Array, covariance: Array) -> Array:
