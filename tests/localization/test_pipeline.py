@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -91,6 +92,27 @@ def test_without_a_prediction_features_lead_the_patches() -> None:
 )
 def test_a_prediction_that_is_wrong_is_got_over(moved: Pose) -> None:
     found(answered(DEFAULT, prior(moved)), "patches")
+
+
+@pytest.mark.parametrize(("share", "enough"), [(0.1, False), (0.25, True)])
+def test_what_hardly_any_of_the_landmarks_in_view_agree_on_is_no_pose(
+    share: float, enough: bool
+) -> None:
+    """All but a share of the image, in windows of 40 px, shows something else."""
+    shot, sensor = demo.shot(DRONE, FRAME), demo.sensor(DRONE)
+    rng = np.random.default_rng(3)
+    something_else = rng.integers(0, 256, shot.image.shape, dtype=np.uint8)
+    is_shown = np.kron(rng.random((6, 8)) < share, np.ones((40, 40), dtype=np.bool_))
+    fix = localize(
+        np.where(is_shown, shot.image, something_else), sensor.camera, sensor.body_from_cam,
+        demo.map_index(1, 2, 3), demo.templates(1, 2, 3), prior(), shot.ned_from_body.rotation,
+        OPTIONS, Effort(may_search=False),
+    )  # fmt: skip
+    if enough:
+        found(fix, "patches")
+    else:
+        assert isinstance(fix, NotLocalized)
+        assert re.fullmatch(r"only \d\d of 400 landmarks in view agree on a pose", fix.reason)
 
 
 def test_what_one_detector_does_not_recognise_another_may() -> None:
