@@ -14,6 +14,10 @@ from vcl_companion.errors import ConfigError
 from vcl_companion.recording.recording import CAMERA_FOLDER
 
 _FLAT_OUT_WAIT_S = 30.0
+# As exactly as a place is surveyed for a recording's truth. What a daemon takes for granted is a
+# tape's centimetre: 30 m away that were 10 cm, and an autopilot that is told of 10 cm follows our
+# poses less than the drift of its own accelerometers.
+_TRUE_DISTANCE_SIGMA_M = 0.002
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -31,6 +35,7 @@ def daemon_config(
     calibration = plan.recording.path.resolve() / planned.name / CAMERA_FOLDER / "sensor.yaml"
     if planned.mission is not None:  # the recording is made as it flies
         calibration = run / "sensor.yaml"
+    exactness = {"distance_sigma_m": _TRUE_DISTANCE_SIGMA_M} if plan.are_distances_true else {}
     wiring = {
         "system_id": planned.system_id,
         "clock": "camera",
@@ -54,7 +59,7 @@ def daemon_config(
             "flight_log": str(run / "flight.jsonl"),
             "status_file": str(run / "status.json"),
         },
-        "map": {"directory": str(run / "maps")},
+        "map": {"directory": str(run / "maps"), **exactness},
     }
     if math.isinf(plan.options.speed):
         # The recording's time stands still meanwhile; the outcome must not hang on the machine.

@@ -113,6 +113,7 @@ class FlightPlan:
         drones: those that fly, in the recording's order.
         leader: name of the one whose start is the origin.
         known_distances: (system id, system id, m).
+        are_distances_true: whether all of them are the truth's, and nobody's measurement.
         options: how it is flown.
     """
 
@@ -120,6 +121,7 @@ class FlightPlan:
     drones: tuple[PlannedDrone, ...]
     leader: str
     known_distances: tuple[tuple[int, int, float], ...]
+    are_distances_true: bool
     options: FlyOptions
 
     @property
@@ -200,11 +202,13 @@ def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:
         if drone.name in flying
     )
     check_flying(options.network.partitions, flying)
+    pairs = _known_pairs(recording, drones, options.known_distances)
     plan = FlightPlan(
         recording=recording,
         drones=drones,
         leader=recording.leader if recording.leader in flying else flying[0],
-        known_distances=_known_distances(recording, drones, options.known_distances),
+        known_distances=_known_distances(drones, pairs),
+        are_distances_true=all(pair.distance_m is None for pair in pairs),
         options=options,
     )
     check_absences(options.absences, flying, (plan.ends_at_ns - plan.starts_at_ns) * 1e-9)
@@ -228,21 +232,27 @@ def _attitude_path(drone: Drone, options: FlyOptions) -> Path | None:
     return None
 
 
-def _known_distances(
+def _known_pairs(
     recording: Recording, drones: Sequence[PlannedDrone], given: Sequence[KnownPair]
-) -> tuple[tuple[int, int, float], ...]:
-    by_name = {drone.name: drone for drone in drones}
+) -> Sequence[KnownPair]:
+    names = [drone.name for drone in drones]
     for pair in given:
         for name in (pair.a, pair.b):
-            if name not in by_name:
-                raise ConfigError(f"--known-distance: {name!r} does not fly ({', '.join(by_name)})")
-    pairs = given or [p for p in recording.known_distances if {p.a, p.b} <= set(by_name)]
+            if name not in names:
+                raise ConfigError(f"--known-distance: {name!r} does not fly ({', '.join(names)})")
+    pairs = given or [p for p in recording.known_distances if {p.a, p.b} <= set(names)]
     if not pairs and len(drones) > 1:
-        a, b = drones[0].name, drones[1].name
         raise ConfigError(
-            f"{recording.path}: no distance is known between two of {', '.join(by_name)}; "
-            f"give --known-distance {a}:{b}=METRES"
+            f"{recording.path}: no distance is known between two of {', '.join(names)}; "
+            f"give --known-distance {names[0]}:{names[1]}=METRES"
         )
+    return pairs
+
+
+def _known_distances(
+    drones: Sequence[PlannedDrone], pairs: Sequence[KnownPair]
+) -> tuple[tuple[int, int, float], ...]:
+    by_name = {drone.name: drone for drone in drones}
     out = []
     for pair in pairs:
         one, other = by_name[pair.a], by_name[pair.b]

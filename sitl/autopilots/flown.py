@@ -32,6 +32,7 @@ from vcl_companion.geometry.pose import Pose
 _HEARTBEAT_S = 1.0
 _GROUND_SYSTEM, _GROUND_COMPONENT = 255, 190
 _STREAM_US, _ESTIMATOR_US = 20_000, 200_000
+_POSES = (dialect.MAVLINK_MSG_ID_VISION_POSITION_ESTIMATE, dialect.MAVLINK_MSG_ID_ODOMETRY)
 
 
 class Firmware(Protocol):
@@ -112,8 +113,8 @@ class Flown:
             )
         self._companion: tuple[str, int] | None = None
         self._backlog = Backlog()
-        # What the companion has sent, and when that arrives.
-        self._under_way: deque[tuple[int, bytes]] = deque()
+        # What the companion has sent, when that arrives, and whether it is a pose.
+        self._under_way: deque[tuple[int, bytes, bool]] = deque()
         self._stopped_at_s = time.monotonic()
         self._asked = False
         self.n_times_told = 0
@@ -159,7 +160,8 @@ class Flown:
                 if message.get_type() == "TIMESYNC" and message.tc1 == 0:
                     self._tell_time(message.ts1)
                 else:
-                    self._under_way.append((arrives_ns, bytes(message.get_msgbuf())))
+                    is_pose = message.get_msgId() in _POSES
+                    self._under_way.append((arrives_ns, bytes(message.get_msgbuf()), is_pose))
         # What its own threads have brought out since it stopped.
         self._hand_on()
 
@@ -168,10 +170,17 @@ class Flown:
         return _HEARTBEAT_S
 
     def _hand_over(self) -> None:
-        """Give the firmware what has arrived by now."""
-        frames = []
-        while self._under_way and self._under_way[0][0] <= self._firmware.now_ns:
-            frames.append(self._under_way.popleft()[1])
+        """Give the firmware what has arrived by now, up to a pose.
+
+        Nothing is given it at once with what comes behind that: ArduPilot takes a pose for older
+        by what all bytes that it has then took at its port's rate (``receive_time_constraint_us``),
+        10 ms for 115 of them, and from there on all poses for as much older (``JitterCorrection``).
+        """
+        frames: list[bytes] = []
+        is_pose = False
+        while not is_pose and self._under_way and self._under_way[0][0] <= self._firmware.now_ns:
+            _, frame, is_pose = self._under_way.popleft()
+            frames.append(frame)
         if frames:
             self._firmware.hear(frames)
 

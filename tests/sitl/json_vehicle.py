@@ -58,15 +58,19 @@ def main() -> None:
             if position is not None:
                 x, y, z = position
                 say(dialect.MAVLink_local_position_ned_message(boot_ms, x + ahead_m, y, z, 0, 0, 0))
+        is_pose = False
         while True:
             try:
                 data = mavlink.recv(65536)
             except BlockingIOError:
                 break
             for message in parser.parse_buffer(data) or []:
+                # With other bytes behind it, it would be taken for older than it is.
+                assert not is_pose, message
+                is_pose = message.get_type() == "VISION_POSITION_ESTIMATE"
                 if message.get_type() == "TIMESYNC" and message.tc1 == 0:
                     say(dialect.MAVLink_timesync_message(int(now_s * 1e9), message.ts1))
-                elif message.get_type() == "VISION_POSITION_ESTIMATE":
+                elif is_pose:
                     position = (message.x, message.y, message.z)
 
 

@@ -10,7 +10,7 @@ from sitl.daemon_config import daemon_config, toml_text, with_settings
 from sitl.plan import FlyOptions, Setting, plan_flight
 from tests.sitl.flights import Flight, write_recording
 from vcl_companion.errors import ConfigError
-from vcl_companion.recording import read_recording
+from vcl_companion.recording import KnownPair, read_recording
 
 SCALARS = (
     st.booleans()
@@ -47,6 +47,17 @@ def test_a_later_setting_wins_and_the_base_is_left_alone() -> None:
     assert base == {"log": {"level": "info"}}
     with pytest.raises(ConfigError, match="level is no section"):
         with_settings(base, [Setting(("log", "level", "deeper"), 1)])
+
+
+@pytest.mark.parametrize(("metres", "told_m"), [(None, 0.002), (2.0, None)])
+def test_a_distance_of_the_truth_s_is_told_as_exact(
+    tmp_path: Path, metres: float | None, told_m: float | None
+) -> None:
+    recording = read_recording(write_recording(tmp_path / "a", Flight(n_frames=2, n_drones=2)))
+    pair = KnownPair("mav0", "mav1", metres)
+    plan = plan_flight(recording, FlyOptions(known_distances=(pair,)))
+    config = daemon_config(plan, plan.drones[0], tmp_path / "out", 5001, 5002, 5003, [5004])
+    assert config["map"].get("distance_sigma_m") == told_m
 
 
 def test_a_daemon_is_told_where_things_are_and_nothing_of_the_truth(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ def test_all_fly_and_ids_are_their_places(recording: Recording) -> None:
     assert [(d.name, d.system_id) for d in plan.drones] == [("mav0", 1), ("mav1", 2), ("mav2", 3)]
     assert plan.leader == "mav0"
     assert plan.known_distances == ((1, 2, 2.0),)
+    assert not plan.are_distances_true
     assert plan.starts_at_ns == at_ns(0, 0)
     assert plan.ends_at_ns == at_ns(2, 1)
 
@@ -40,7 +41,9 @@ def test_a_subset_keeps_its_ids_and_gets_a_leader(recording: Recording) -> None:
 def test_a_distance_without_metres_is_the_truth_s_at_the_start(recording: Recording) -> None:
     options = FlyOptions(known_distances=(KnownPair("mav0", "mav2"),))
     apart = ned_from_body(2, 0).translation - ned_from_body(0, 0).translation
-    ((a, b, distance_m),) = plan_flight(recording, options).known_distances
+    plan = plan_flight(recording, options)
+    assert plan.are_distances_true
+    ((a, b, distance_m),) = plan.known_distances
     assert (a, b) == (1, 3)
     assert distance_m == pytest.approx(np.linalg.norm(apart), abs=1e-9)
 
