@@ -1,4 +1,4 @@
-"""When a drone's daemon is not there: started late, killed in flight, started again."""
+"""When a drone's daemon is not there, late or killed in flight, and when its camera is dead."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from vcl_companion.errors import ConfigError
 
 _LATE_LIKE = "like mav2=8 (its daemon is started at second 8)"
 _KILL_LIKE = "like mav0=12 (killed at second 12), or mav0=12-20 (and started again at second 20)"
+_BLIND_LIKE = "like mav0=12 (dead from second 12 on), or mav0=12-20 (until second 20)"
 _WHEN = re.compile(r"([0-9.]+)(?:-([0-9.]+))?")
 
 
@@ -42,6 +43,34 @@ class Absence:
         return f"--kill {self.drone}={self.from_s:g}{until}"
 
 
+@dataclass(frozen=True)
+class Blindness:
+    """A time in which the camera of a drone gives no frames; its daemon and its autopilot go on.
+
+    Attributes:
+        drone: ``mavN``.
+        from_s: of the last frame before, at the latest; a flight's seconds count from its first.
+        until_s: of the next frame; infinite for never.
+    """
+
+    drone: str
+    from_s: float
+    until_s: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.from_s < self.until_s:
+            raise ConfigError(f"{self}: must end after it has begun, {_BLIND_LIKE}")
+
+    def __str__(self) -> str:
+        """Return the option that says so."""
+        until = "" if math.isinf(self.until_s) else f"-{self.until_s:g}"
+        return f"--blind {self.drone}={self.from_s:g}{until}"
+
+    def has(self, drone: str, at_s: float) -> bool:
+        """Return whether a drone's frame of that second is not given."""
+        return drone == self.drone and self.from_s <= at_s < self.until_s
+
+
 def parse_late(text: str) -> Absence:
     """Return what ``mav2=8`` says.
 
@@ -66,6 +95,36 @@ def parse_kill(text: str) -> Absence:
     return Absence(drone, at_s, math.inf if until_s is None else until_s)
 
 
+def parse_blind(text: str) -> Blindness:
+    """Return what ``mav0=12`` or ``mav0=12-20`` says.
+
+    Raises:
+        ConfigError: it has another form.
+    """
+    drone, at_s, until_s = _drone_and_times(text)
+    if not drone or not 0.0 < at_s < math.inf:
+        raise ConfigError(f"--blind {text}: expected DRONE=SECOND above 0, {_BLIND_LIKE}")
+    return Blindness(drone, at_s, math.inf if until_s is None else until_s)
+
+
+def check_times(
+    times: Sequence[Absence | Blindness], names: Sequence[str], duration_s: float
+) -> None:
+    """Raise ConfigError when what happens to a drone does not go with a flight.
+
+    Args:
+        times: all of them.
+        names: who flies.
+        duration_s: of the flight.
+    """
+    for time in times:
+        if time.drone not in names:
+            raise ConfigError(f"{time}: {time.drone!r} does not fly ({', '.join(names)})")
+        last_s = time.from_s if math.isinf(time.until_s) else time.until_s
+        if last_s >= duration_s:
+            raise ConfigError(f"{time}: the flight is over after {duration_s:.1f} s")
+
+
 def check_absences(absences: Sequence[Absence], names: Sequence[str], duration_s: float) -> None:
     """Raise ConfigError when absences do not go together, or not with a flight.
 
@@ -74,12 +133,7 @@ def check_absences(absences: Sequence[Absence], names: Sequence[str], duration_s
         names: who flies.
         duration_s: of the flight.
     """
-    for absence in absences:
-        if absence.drone not in names:
-            raise ConfigError(f"{absence}: {absence.drone!r} does not fly ({', '.join(names)})")
-        last_s = absence.from_s if math.isinf(absence.until_s) else absence.until_s
-        if last_s >= duration_s:
-            raise ConfigError(f"{absence}: the flight is over after {duration_s:.1f} s")
+    check_times(absences, names, duration_s)
     ordered = sorted(absences, key=lambda absence: (absence.drone, absence.from_s))
     for one, next_one in itertools.pairwise(ordered):
         if one.drone == next_one.drone and next_one.from_s <= one.until_s:

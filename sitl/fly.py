@@ -170,7 +170,7 @@ async def _play(
         await asyncio.sleep(max(0.0, pace.wait_s(moment.at_ns, time.monotonic())))
         await swarm.kill_and_start(moment.at_ns)
         held_before_s = shots.held_s
-        await _hand_out(moment, swarm, shots)
+        await _hand_out(moment, plan, swarm, shots)
         pace = pace.held(shots.held_s - held_before_s)
         conduct.ended_at_ns = moment.at_ns
         if k == 0:
@@ -191,9 +191,14 @@ async def _play(
     conduct.flight_s = time.monotonic() - begun_s - conduct.start_s
 
 
-async def _hand_out(moment: Instant, swarm: Swarm, shots: Shots) -> None:
+async def _hand_out(moment: Instant, plan: FlightPlan, swarm: Swarm, shots: Shots) -> None:
     await swarm.advance_to(moment.at_ns)
-    given = {due.drone: due for due in moment.frames}
+    at_s = (moment.at_ns - plan.starts_at_ns) * 1e-9
+    given = {
+        due.drone: due
+        for due in moment.frames
+        if not any(b.has(plan.drones[due.drone].name, at_s) for b in plan.options.blind)
+    }
     images = await shots.taken(moment, swarm)
     for n, drone in enumerate(swarm.drones):
         if not drone.camera.is_connected:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.absences import Absence, check_absences
+from sitl.absences import Absence, Blindness, check_absences, check_times
 from sitl.firmware import FirmwareBinary
 from sitl.mission import Mission
 from sitl.network import NetworkOptions
@@ -52,6 +52,7 @@ class FlyOptions:
         seed: of the noise of the attitude, and of the network.
         network: how bad the radio between the drones is.
         absences: when whose daemon does not run.
+        blind: when whose camera gives nothing.
         firmware: real autopilot software in the stand-ins' place; None: stand-ins.
     """
 
@@ -64,6 +65,7 @@ class FlyOptions:
     seed: int = 0
     network: NetworkOptions = field(default_factory=NetworkOptions)
     absences: tuple[Absence, ...] = ()
+    blind: tuple[Blindness, ...] = ()
     firmware: FirmwareBinary | None = None
 
     def __post_init__(self) -> None:
@@ -211,7 +213,9 @@ def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:
         are_distances_true=all(pair.distance_m is None for pair in pairs),
         options=options,
     )
-    check_absences(options.absences, flying, (plan.ends_at_ns - plan.starts_at_ns) * 1e-9)
+    duration_s = (plan.ends_at_ns - plan.starts_at_ns) * 1e-9
+    check_absences(options.absences, flying, duration_s)
+    check_times(options.blind, flying, duration_s)
     return plan
 
 

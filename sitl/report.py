@@ -103,6 +103,7 @@ def report_of(result: FlightResult) -> dict[str, Any]:
             "network": options_of(options.network),
             "start_timeout_s": options.start_timeout_s,
             "absences": [str(absence) for absence in options.absences],
+            "blind": [str(blindness) for blindness in options.blind],
             "settings": {".".join(setting.path): setting.value for setting in options.settings},
         },
         "drones": {

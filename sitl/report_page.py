@@ -287,6 +287,7 @@ def _options(report: Mapping[str, Any]) -> str:
         ("pipeline", report["pipeline"]),
         ("settings", settings or "defaults"),
         ("absences", ", ".join(options["absences"]) or "none"),
+        ("dead cameras", ", ".join(options["blind"]) or "none"),
         ("map revisions", f"{swarm_map['revisions']} ({swarm_map['keyframes']} keyframes)"),
     ]
     if wall:

@@ -9,6 +9,7 @@ import click
 from sitl.commands.options import (
     FOLDER,
     PIPELINES,
+    blind_option,
     drones_option,
     parameters_option,
     settings_option,
@@ -104,6 +105,7 @@ def _names(text: str) -> tuple[str, ...]:
     metavar="mav0=12-20",
     help="Kill a drone's daemon (SIGKILL) at a second, and start it again at another (repeatable).",
 )
+@blind_option
 def fly(
     recording: Path,
     out: Path,
@@ -131,6 +133,7 @@ def fly(
     partitions: tuple[str, ...],
     late: tuple[str, ...],
     kills: tuple[str, ...],
+    blind: tuple[str, ...],
 ) -> None:
     """Fly RECORDING (a folder; the embedded demo by default) and report how it went.
 
@@ -143,7 +146,7 @@ def fly(
     """
     from rich.console import Console
 
-    from sitl.absences import parse_kill, parse_late
+    from sitl.absences import parse_blind, parse_kill, parse_late
     from sitl.firmware import parse_firmware
     from sitl.fly import fly as fly_recording
     from sitl.network import NetworkOptions
@@ -177,6 +180,7 @@ def fly(
             partitions=tuple(map(parse_partition, partitions)),
         ),
         absences=(*map(parse_late, late), *map(parse_kill, kills)),
+        blind=tuple(map(parse_blind, blind)),
         firmware=parse_firmware(autopilot, parameters) if autopilot else None,
     )
     embedded = str(recording) == "demo" and not recording.exists()
@@ -206,6 +210,7 @@ def fly(
     help="Begin with the last map of an earlier flight: its --out. One drone alone needs one.",
 )
 @start_timeout_option(60.0)
+@blind_option
 @settings_option
 def live(
     scenario: str,
@@ -216,6 +221,7 @@ def live(
     drones: str,
     map_of: Path | None,
     start_timeout: float,
+    blind: tuple[str, ...],
     settings: tuple[str, ...],
 ) -> None:
     """Fly the missions of SCENARIO without GPS (a TOML file, or the name of an embedded one).
@@ -226,6 +232,7 @@ def live(
     """
     from rich.console import Console
 
+    from sitl.absences import parse_blind
     from sitl.firmware import parse_firmware
     from sitl.live import fly_live
     from sitl.plan import FlyOptions, parse_setting
@@ -237,6 +244,7 @@ def live(
         drones=_names(drones),
         start_timeout_s=start_timeout,
         settings=tuple(map(parse_setting, settings)),
+        blind=tuple(map(parse_blind, blind)),
         firmware=parse_firmware(autopilot, parameters),
     )
     console = Console()

@@ -46,6 +46,12 @@ speed_option = click.option(
 drones_option = click.option(
     "--drones", default="", metavar="mav0,mav1", help="Only these fly; otherwise all of them."
 )
+blind_option = click.option(
+    "--blind",
+    multiple=True,
+    metavar="mav0=12-20",
+    help="A drone's camera gives nothing from a second on, or between two (repeatable).",
+)
 settings_option = click.option(
     "--set",
     "settings",

@@ -11,7 +11,15 @@ from typing import Any
 
 import pytest
 
-from sitl.absences import Absence, check_absences, parse_kill, parse_late
+from sitl.absences import (
+    Absence,
+    Blindness,
+    check_absences,
+    check_times,
+    parse_blind,
+    parse_kill,
+    parse_late,
+)
 from sitl.frame_server import FrameServer
 from sitl.lives import Life, Lives, log_path, write_lives
 from sitl.report import report_of, write_report
@@ -33,12 +41,29 @@ def test_who_is_late_and_who_is_killed_on_the_command_line() -> None:
         assert str((parse_late if option == "--late" else parse_kill)(text)) == said
 
 
+def test_whose_camera_dies_on_the_command_line() -> None:
+    assert parse_blind("mav0=12") == Blindness("mav0", 12.0, math.inf)
+    dead = parse_blind(" mav0 = 12.5-20")
+    assert (dead, str(dead)) == (Blindness("mav0", 12.5, 20.0), "--blind mav0=12.5-20")
+    seen = [(at_s, dead.has("mav0", at_s)) for at_s in (12.4, 12.5, 19.9, 20.0)]
+    assert seen == [(12.4, False), (12.5, True), (19.9, True), (20.0, False)]
+    assert not dead.has("mav1", 15.0)
+    with pytest.raises(ConfigError, match="--blind mav0=20-12: must end after it has begun"):
+        parse_blind("mav0=20-12")
+    with pytest.raises(ConfigError, match="--blind mav7=8: 'mav7' does not fly"):
+        check_times([parse_blind("mav7=8")], NAMES, 28.4)
+    with pytest.raises(ConfigError, match=r"--blind mav0=30: the flight is over after 28\.4 s"):
+        check_times([parse_blind("mav0=30")], NAMES, 28.4)
+
+
 @pytest.mark.parametrize("text", ["", "mav2", "mav2=", "=8", "mav2=0", "mav2=x", "mav2=1.2.3"])
 def test_what_is_no_time_says_what_would_be(text: str) -> None:
     with pytest.raises(ConfigError, match=r"--late .*like mav2=8 \(its daemon"):
         parse_late(text)
     with pytest.raises(ConfigError, match=r"--kill .*like mav0=12 \(killed"):
         parse_kill(text)
+    with pytest.raises(ConfigError, match=r"--blind .*like mav0=12 \(dead"):
+        parse_blind(text)
 
 
 @pytest.mark.parametrize("text", ["mav2=1-2", "mav2=-3"])

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -188,6 +189,24 @@ def test_a_swarm_flies_over_a_bad_network_and_the_report_says_how_bad(
     assert [event for event in report["events"] if event["kind"] == "harness"] == []
 
 
+def test_a_camera_that_dies_ends_in_silence_and_its_return_in_poses(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = sitl_fly(DEMO, "--out", out, "--speed", "max", "--blind", "mav1=1-4")
+    assert done.returncode == 0, done.stderr
+    report = report_in(out)
+    assert report["options"]["blind"] == ["--blind mav1=1-4"]
+    assert "--blind mav1=1-4" in (out / "report.html").read_text()
+    for name, n_blind in (("mav0", 0), ("mav1", 15)):
+        drone = report["drones"][name]
+        n_frames = 60 - n_blind
+        assert (drone["frames"], drone["frames_localized"]) == (n_frames, n_frames)
+    told_s = np.array([pose["usec"] for pose in poses_received(out, "mav1")]) * 1e-6
+    told_s -= told_s[0]
+    # Between frames, and half a second beyond the last one.
+    assert told_s[told_s < 4.0].max() == pytest.approx(0.8 + 0.5, abs=0.01)
+    assert told_s[told_s > 1.4].min() == pytest.approx(4.0, abs=0.01)
+
+
 def test_nothing_of_the_truth_reaches_a_daemon(
     flown: Path, recording: Path, tmp_path: Path
 ) -> None:
@@ -197,6 +216,7 @@ def test_nothing_of_the_truth_reaches_a_daemon(
         shutil.rmtree(blind / name / "state_groundtruth_estimate0")
     distance_m = report_in(flown)["options"]["known_distances_m"]
     known = [f"--known-distance={pair}={metres!r}" for pair, metres in distance_m.items()]
+    known.append("--set=map.distance_sigma_m=0.002")  # nobody measured them
     out = tmp_path / "again"
     done = sitl_fly(blind, "--out", out, "--speed", "max", "--attitude", flown, *known)
     assert done.returncode == 0, done.stderr
