@@ -22,7 +22,7 @@ from sitl.stand_in_process import StandIn
 from tests.sitl.real_firmware import Real
 from vcl_companion.clock import ManualClock
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import matrix_from_euler
+from vcl_companion.geometry.rotation import Array, matrix_from_euler
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.vision_pose import PoseEstimate
@@ -42,6 +42,8 @@ MISSION = Mission(
 NORTH_RAD = {"ardupilot": -0.6, "px4": 0.0}
 # When each is on its way; what it flies in then.
 UNDER_WAY_S = {"ardupilot": 9.0, "px4": 18.0}
+# As many as PX4 follows of itself in the air, where it is told of none.
+N_RESETS, RESET_EVERY_S, RESET_M = 5, 1.5, np.array([0.6, 0.0, 0.0])
 STEERED_IN = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}
 
 
@@ -54,6 +56,8 @@ class Companion:
         self.link = AutopilotLink(options, SYSTEM, self.clock)
         self.autopilot = autopilot
         self.true: list[Pose] = []
+        self.told: list[tuple[int, Array]] = []
+        self.resets_s: tuple[float, ...] = ()
         north = Pose(matrix_from_euler(0.0, 0.0, NORTH_RAD[real.kind]), np.zeros(3))
         self._local_from_ned = north @ Pose(np.eye(3), -MISSION.ned_from_body.translation)
 
@@ -71,14 +75,21 @@ class Companion:
             await asyncio.sleep(0.001)
 
     def _tell(self, at_ns: int) -> None:
-        told = self._local_from_ned @ self.true[-1]
+        n_resets = sum(at_ns >= START_NS + at_s * 1e9 for at_s in self.resets_s)
+        shift = Pose(np.eye(3), RESET_M * (n_resets % 2))
+        told = self._local_from_ned @ shift @ self.true[-1]
+        self.told.append((at_ns, told.translation))
         covariance = np.diag([0.02**2] * 3 + [1e-4] * 3)
-        estimate = PoseEstimate(told, covariance, np.zeros(3), 0.01 * np.eye(3), at_ns, 0)
+        estimate = PoseEstimate(told, covariance, np.zeros(3), 0.01 * np.eye(3), at_ns, n_resets)
         assert self.link.poses.send(estimate) is None
 
 
 async def flown(
-    real: Real, tmp_path: Path, seconds: float, silent_after_s: float = np.inf
+    real: Real,
+    tmp_path: Path,
+    seconds: float,
+    silent_after_s: float = np.inf,
+    resets_s: tuple[float, ...] = (),
 ) -> Companion:
     config = {
         "binary": str(parse_firmware(f"{real.kind}={os.environ[real.variable]}").path),
@@ -100,6 +111,7 @@ async def flown(
     )
     try:
         companion = Companion(real, await StandIn.of(child))
+        companion.resets_s = resets_s
         await companion.autopilot.advance_to(START_NS)
         async with asyncio.timeout(300.0):
             link = asyncio.ensure_future(companion.link.run())
@@ -134,6 +146,28 @@ def test_it_arms_takes_off_goes_where_it_is_sent_and_lands_there(
         "lands",
         "landed",
     ]
+
+
+def test_five_resets_in_the_air_are_each_followed_and_the_mission_is_flown_to_its_end(
+    real: Real, tmp_path: Path
+) -> None:
+    first_s = UNDER_WAY_S[real.kind]
+    resets_s = tuple(first_s + RESET_EVERY_S * n for n in range(N_RESETS))
+    companion = asyncio.run(flown(real, tmp_path, 90.0, resets_s=resets_s))
+    state = companion.autopilot.state
+    said = (tmp_path / "out" / "said.csv").read_text()
+    assert (state["is_over"], state["trouble"]) == (True, ""), said
+    fused = np.loadtxt(tmp_path / "out" / "fused.csv", delimiter=",", skiprows=1)
+    told_ns = np.array([at_ns for at_ns, _ in companion.told])
+    told_m = np.array([place for _, place in companion.told])
+    at = [np.interp(fused[:, 0], told_ns, told_m[:, i]) for i in range(2)]
+    apart_m = np.hypot(fused[:, 1] - at[0], fused[:, 2] - at[1])
+    for reset_s in resets_s:
+        since_s = (fused[:, 0] - START_NS) * 1e-9 - reset_s
+        assert apart_m[(since_s > 0.3) & (since_s < RESET_EVERY_S - 0.2)].max() < 0.25
+    # It flies to where it was sent in the frame that it was left in.
+    ended = companion.true[-1].translation
+    assert np.linalg.norm(ended[:2] - (11.0, 1.0) + RESET_M[:2]) < 0.3
 
 
 def test_where_we_fall_silent_it_gives_up_its_mission_and_lands_by_itself(
