@@ -49,8 +49,8 @@ class Blindness:
 
     Attributes:
         drone: ``mavN``.
-        from_s: of the last frame before, at the latest; a flight's seconds count from its first.
-        until_s: of the next frame; infinite for never.
+        from_s: frames from this second on are not given; a flight's count from its first frame.
+        until_s: from this one on they are again; infinite for never.
     """
 
     drone: str

@@ -15,8 +15,8 @@ from vcl_companion.recording.recording import CAMERA_FOLDER
 
 _FLAT_OUT_WAIT_S = 30.0
 # As exactly as a place is surveyed for a recording's truth. What a daemon takes for granted is a
-# tape's centimetre: 30 m away that were 10 cm, and an autopilot that is told of 10 cm follows our
-# poses less than the drift of its own accelerometers.
+# tape's centimetre: of drones 3 m apart it makes poses 30 m away uncertain by 10 cm, and an
+# autopilot that is told of 10 cm follows them less than the drift of its own accelerometers.
 _TRUE_DISTANCE_SIGMA_M = 0.002
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 

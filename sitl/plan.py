@@ -115,7 +115,7 @@ class FlightPlan:
         drones: those that fly, in the recording's order.
         leader: name of the one whose start is the origin.
         known_distances: (system id, system id, m).
-        are_distances_true: whether all of them are the truth's, and nobody's measurement.
+        are_distances_true: whether there are some, and all the truth's: nobody's measurement.
         options: how it is flown.
     """
 
@@ -210,7 +210,7 @@ def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:
         drones=drones,
         leader=recording.leader if recording.leader in flying else flying[0],
         known_distances=_known_distances(drones, pairs),
-        are_distances_true=all(pair.distance_m is None for pair in pairs),
+        are_distances_true=bool(pairs) and all(pair.distance_m is None for pair in pairs),
         options=options,
     )
     duration_s = (plan.ends_at_ns - plan.starts_at_ns) * 1e-9

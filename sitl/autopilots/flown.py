@@ -32,6 +32,8 @@ from vcl_companion.geometry.pose import Pose
 _HEARTBEAT_S = 1.0
 _GROUND_SYSTEM, _GROUND_COMPONENT = 255, 190
 _STREAM_US, _ESTIMATOR_US = 20_000, 200_000
+# Two of ArduCopter's loops, in each of which it looks at its port once.
+_AFTER_A_POSE_NS = 5_000_000
 _POSES = (dialect.MAVLINK_MSG_ID_VISION_POSITION_ESTIMATE, dialect.MAVLINK_MSG_ID_ODOMETRY)
 
 
@@ -115,6 +117,7 @@ class Flown:
         self._backlog = Backlog()
         # What the companion has sent, when that arrives, and whether it is a pose.
         self._under_way: deque[tuple[int, bytes, bool]] = deque()
+        self._not_before_ns = 0
         self._stopped_at_s = time.monotonic()
         self._asked = False
         self.n_times_told = 0
@@ -172,15 +175,17 @@ class Flown:
     def _hand_over(self) -> None:
         """Give the firmware what has arrived by now, up to a pose.
 
-        Nothing is given it at once with what comes behind that: ArduPilot takes a pose for older
-        by what all bytes that it has then took at its port's rate (``receive_time_constraint_us``),
-        10 ms for 115 of them, and from there on all poses for as much older (``JitterCorrection``).
+        What comes behind that waits until it is read: ArduPilot takes a pose for older by what all
+        bytes that it has then took at its port's rate (``receive_time_constraint_us``), 10 ms for
+        115 of them, and from there on all poses for as much older (``JitterCorrection``).
         """
+        now_ns = self._firmware.now_ns
         frames: list[bytes] = []
-        is_pose = False
-        while not is_pose and self._under_way and self._under_way[0][0] <= self._firmware.now_ns:
+        while self._not_before_ns <= now_ns and self._under_way and self._under_way[0][0] <= now_ns:
             _, frame, is_pose = self._under_way.popleft()
             frames.append(frame)
+            if is_pose:
+                self._not_before_ns = now_ns + _AFTER_A_POSE_NS
         if frames:
             self._firmware.hear(frames)
 

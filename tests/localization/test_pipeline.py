@@ -95,7 +95,7 @@ def test_a_prediction_that_is_wrong_is_got_over(moved: Pose) -> None:
 
 
 @pytest.mark.parametrize(("share", "enough"), [(0.1, False), (0.25, True)])
-def test_what_hardly_any_of_the_landmarks_in_view_agree_on_is_no_pose(
+def test_what_hardly_any_of_the_landmarks_tried_agree_on_is_no_pose(
     share: float, enough: bool
 ) -> None:
     """All but a share of the image, in windows of 40 px, shows something else."""
@@ -112,7 +112,7 @@ def test_what_hardly_any_of_the_landmarks_in_view_agree_on_is_no_pose(
         found(fix, "patches")
     else:
         assert isinstance(fix, NotLocalized)
-        assert re.fullmatch(r"only \d\d of 400 landmarks in view agree on a pose", fix.reason)
+        assert re.fullmatch(r"only \d\d of 400 landmarks tried agree on a pose", fix.reason)
 
 
 def test_what_one_detector_does_not_recognise_another_may() -> None:

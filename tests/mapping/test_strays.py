@@ -37,7 +37,7 @@ class Facade:
         self.is_wrong = np.arange(n) >= WALL + NEAR
 
     def strays(self, cut_from: int = 0) -> NDArray[np.bool_]:
-        """Which patches of one of the views stray, found in both."""
+        """(N, 2) which patches stray that were cut from one view and found in both."""
         reference = np.full(len(self.points), cut_from, dtype=np.intp)
         return strays(self.points, self.observed_px, reference, [CAMERA] * 2, self.cams)
 

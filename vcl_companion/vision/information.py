@@ -35,7 +35,7 @@ def covariance_of(information: Array, least_eigenvalue: float) -> Array | None:
 
 
 def robust_sigma(errors: Array) -> float:
-    """Return the 1 sigma of normal errors, (N,), of which less than half may be wrong."""
+    """Return the 1 sigma of normal errors about 0, (N,), of which less than half may be wrong."""
     return 1.4826 * float(np.median(np.abs(errors)))
 
 
