@@ -89,10 +89,7 @@ def parse_kill(text: str) -> Absence:
     Raises:
         ConfigError: it has another form.
     """
-    drone, at_s, until_s = _drone_and_times(text)
-    if not drone or not 0.0 < at_s < math.inf:
-        raise ConfigError(f"--kill {text}: expected DRONE=SECOND above 0, {_KILL_LIKE}")
-    return Absence(drone, at_s, math.inf if until_s is None else until_s)
+    return Absence(*_from_until("--kill", text, _KILL_LIKE))
 
 
 def parse_blind(text: str) -> Blindness:
@@ -101,10 +98,7 @@ def parse_blind(text: str) -> Blindness:
     Raises:
         ConfigError: it has another form.
     """
-    drone, at_s, until_s = _drone_and_times(text)
-    if not drone or not 0.0 < at_s < math.inf:
-        raise ConfigError(f"--blind {text}: expected DRONE=SECOND above 0, {_BLIND_LIKE}")
-    return Blindness(drone, at_s, math.inf if until_s is None else until_s)
+    return Blindness(*_from_until("--blind", text, _BLIND_LIKE))
 
 
 def check_times(
@@ -140,6 +134,13 @@ def check_absences(absences: Sequence[Absence], names: Sequence[str], duration_s
             raise ConfigError(f"{next_one}: is not running then, by {one}")
     if {absence.drone for absence in absences if absence.from_s == 0.0} >= set(names):
         raise ConfigError("--late: nobody is there from the start")
+
+
+def _from_until(option: str, text: str, like: str) -> tuple[str, float, float]:
+    drone, at_s, until_s = _drone_and_times(text)
+    if not drone or not 0.0 < at_s < math.inf:
+        raise ConfigError(f"{option} {text}: expected DRONE=SECOND above 0, {like}")
+    return drone, at_s, math.inf if until_s is None else until_s
 
 
 def _drone_and_times(text: str) -> tuple[str, float, float | None]:
