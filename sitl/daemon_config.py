@@ -17,7 +17,10 @@ _FLAT_OUT_WAIT_S = 30.0
 # As exactly as a place is surveyed for a recording's truth. What a daemon takes for granted is a
 # tape's centimetre: of drones 3 m apart it makes poses 30 m away uncertain by 10 cm, and an
 # autopilot that is told of 10 cm follows them less than the drift of its own accelerometers.
-_TRUE_DISTANCE_SIGMA_M = 0.002
+_TRUE_DISTANCE_SIGMA_M = 0.001
+# Autopilots in simulation have the cameras' clock. What is left are the steps in which their
+# estimators take poses in: anywhere within 10 ms (ArduPilot's EKF3).
+_TRUE_TIME_ERROR_S = 0.003
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -43,7 +46,10 @@ def daemon_config(
             "source": f"stream:127.0.0.1:{camera_port}",
             "calibration": str(calibration),
         },
-        "autopilot": {"link": f"udp:127.0.0.1:{autopilot_port}"},
+        "autopilot": {
+            "link": f"udp:127.0.0.1:{autopilot_port}",
+            "time_error_s": _TRUE_TIME_ERROR_S,
+        },
         "peers": {
             "listen": f"127.0.0.1:{peer_port}",
             "to": [f"127.0.0.1:{port}" for port in other_peer_ports],

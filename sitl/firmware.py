@@ -18,7 +18,7 @@ _BUILT: dict[Kind, tuple[str, str]] = {
     "ardupilot": ("build/sitl/bin/arducopter", ""),
     "px4": ("build/px4_sitl_default", "bin/px4"),
 }
-_HEIGHT_BY_VISION = 3.0
+_BAROMETER, _VISION = 0.0, 3.0
 _NAME = re.compile(r"[A-Z][A-Z0-9_]{0,15}")
 
 
@@ -36,10 +36,15 @@ class FirmwareBinary:
     path: Path
     parameters: tuple[tuple[str, float], ...] = ()
 
-    @property
-    def has_own_height(self) -> bool:
-        """Whether its height counts from where it was switched on, by a barometer."""
-        return self.kind == "px4" and dict(self.parameters).get("EKF2_HGT_REF") != _HEIGHT_BY_VISION
+    def has_own_height(self, *, flies_itself: bool) -> bool:
+        """Return whether its height counts from where it was switched on, by a barometer.
+
+        Args:
+            flies_itself: whether it does, in a live flight; in a recorded one it is moved.
+        """
+        usual = _BAROMETER if flies_itself else _VISION
+        reference = dict(self.parameters).get("EKF2_HGT_REF", usual)
+        return self.kind == "px4" and reference != _VISION
 
     @property
     def holds_at_rest(self) -> bool:

@@ -222,7 +222,9 @@ def _drone_result(
         true = tuple(truth[n] if n >= 0 else None for n in frame_of.tolist())
         errors = pose_errors(estimates, true, alignment)
     axes = NED_FROM_REFERENCE[planned.drone.sensor.reference_axes].T
-    has_own_height = firmware is not None and firmware.has_own_height
+    has_own_height = firmware is not None and firmware.has_own_height(
+        flies_itself=planned.mission is not None
+    )
     return DroneResult(
         name=planned.name,
         frames_at_ns=planned.frames_at_ns,

@@ -29,6 +29,7 @@ class ArduCopterProcess:
     """
 
     estimator_message = dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT
+    position_message = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
 
     def __init__(self, options: FirmwareOptions, wire: Wire, stack: ExitStack) -> None:
         self.now_ns = options.boot_offset_ns

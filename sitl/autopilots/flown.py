@@ -43,10 +43,12 @@ class Firmware(Protocol):
     Attributes:
         now_ns: the instant of the recording that it has come to.
         estimator_message: id of the message that has its estimator's flags.
+        position_message: id of the one that has its position, and its instant.
     """
 
     now_ns: int
     estimator_message: int
+    position_message: int
 
     def is_due(self, until_ns: int) -> bool:
         """Return whether one more step is to be done until an instant."""
@@ -99,11 +101,11 @@ class Flown:
         self._options = options
         self._udp = udp
         options.out.mkdir(parents=True, exist_ok=True)
-        self._noting = Noting(options.out, stack)
         received = stack.enter_context((options.out / "received.jsonl").open("w", buffering=1))
         self._hearing = Hearing(received)
         self.wire = Wire(stack)
         self._firmware = start(options, self.wire, stack)
+        self._noting = Noting(options.out, self._firmware.position_message, stack)
         self._parser = dialect.MAVLink(None)
         self._parser.robust_parsing = True
         self._ground = dialect.MAVLink(None, _GROUND_SYSTEM, _GROUND_COMPONENT)
@@ -225,12 +227,14 @@ class Flown:
         if not self._asked:
             self._asked = True
             # Attitude is asked for by the companion as well, but not before the recording begins.
-            for wanted, interval_us in (
-                (dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, _STREAM_US),
-                (dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, _STREAM_US),
-                (dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, _ESTIMATOR_US),
-                (self._firmware.estimator_message, _ESTIMATOR_US),
-            ):
+            streams_us = {
+                dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _STREAM_US,
+                self._firmware.position_message: _STREAM_US,
+                dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: _STREAM_US,
+                dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: _ESTIMATOR_US,
+                self._firmware.estimator_message: _ESTIMATOR_US,
+            }
+            for wanted, interval_us in streams_us.items():
                 messages.append(
                     dialect.MAVLink_command_long_message(
                         self._options.system_id, 1, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0,

@@ -1,7 +1,7 @@
 """What a real firmware says of itself, written down for the report.
 
 ``attitude.csv``, where its nose points (ATTITUDE_QUATERNION); ``fused.csv``, where it believes to
-be (``at_ns,x,y,z`` of LOCAL_POSITION_NED); ``global.csv``, where on Earth, once it knows
+be (``at_ns,x,y,z`` of its position message); ``global.csv``, where on Earth, once it knows
 (``at_ns,latitude_deg,longitude_deg,altitude_m`` of GLOBAL_POSITION_INT); ``said.csv``, its texts
 and its estimator's flags.
 """
@@ -13,6 +13,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, TextIO
 
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
 _ESTIMATOR_KINDS = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
 
 
@@ -21,10 +23,13 @@ class Noting:
 
     Args:
         out: the folder of the files.
+        position_message: id of the one that has its position: LOCAL_POSITION_NED, or ODOMETRY.
         stack: closes them.
     """
 
-    def __init__(self, out: Path, stack: ExitStack) -> None:
+    def __init__(self, out: Path, position_message: int, stack: ExitStack) -> None:
+        self._position_message = position_message
+
         def opened(name: str, head: str) -> TextIO:
             file = stack.enter_context((out / name).open("w", buffering=1))
             file.write(head)
@@ -57,8 +62,10 @@ class Noting:
             at_ns = message.time_boot_ms * 1_000_000 - self.clock_ahead_ns
             quaternion = (message.q1, message.q2, message.q3, message.q4)
             self._attitudes.write(f"{at_ns},{','.join(map(repr, quaternion))}\n")
-        elif kind == "LOCAL_POSITION_NED":
-            at_ns = message.time_boot_ms * 1_000_000 - self.clock_ahead_ns
+        elif message.get_msgId() == self._position_message:
+            has_us = self._position_message == dialect.MAVLINK_MSG_ID_ODOMETRY
+            since_us = message.time_usec if has_us else message.time_boot_ms * 1000
+            at_ns = since_us * 1000 - self.clock_ahead_ns
             self._fused.write(f"{at_ns},{message.x!r},{message.y!r},{message.z!r}\n")
         elif kind == "GLOBAL_POSITION_INT" and (message.lat or message.lon):
             at_ns = message.time_boot_ms * 1_000_000 - self.clock_ahead_ns

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from sitl.mission import Mission
 
-RECORDED = {
+_VISION_ALONE = {
     # Position, height and heading by vision (its documentation, "Visual Inertial Odometry").
     "EKF2_EV_CTRL": 11.0,
     # No GPS, which is not missed before it arms either.
     "EKF2_GPS_CTRL": 0.0,
     "SYS_HAS_GPS": 0.0,
-    # Height is the barometer's, as with its default, GPS, where there is none.
-    "EKF2_HGT_REF": 0.0,
     # What our poses say of their error is what it is.
     "EKF2_EVP_NOISE": 0.01,
     # What it hears is as late as we are quick: nothing on the way is to be made up for.
@@ -19,12 +17,16 @@ RECORDED = {
     # Nobody reads its log.
     "SDLOG_MODE": -1.0,
 }
+# Height is ours too: nobody tells it a global origin.
+RECORDED = {**_VISION_ALONE, "EKF2_HGT_REF": 3.0}
 
 
 def of_a_mission(mission: Mission) -> dict[str, float]:
     """Return those of one that flies by itself, with all of its checks before it arms."""
     return {
-        **RECORDED,
+        **_VISION_ALONE,
+        # Its pilot tells it an origin, which would throw a height by vision: the barometer's.
+        "EKF2_HGT_REF": 0.0,
         # No remote control, nor a joystick; so who may not fly to setpoints any more lands.
         "COM_RC_IN_MODE": 4.0,
         "COM_OBL_RC_ACT": 4.0,

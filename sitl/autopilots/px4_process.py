@@ -56,6 +56,8 @@ class Px4Process(ABC):
     """
 
     estimator_message = dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS
+    # Its LOCAL_POSITION_NED has the instant at which it was said, a step late now and then.
+    position_message = dialect.MAVLINK_MSG_ID_ODOMETRY
 
     def __init__(
         self,
@@ -75,6 +77,7 @@ class Px4Process(ABC):
         self._unread: deque[bytes] = deque()
         self._runs = False
         self._n_asked = self._n_answered = 0
+        self._has_told = False  # what time it is, and it may not have read that yet
         self._answers = dialect.MAVLink(None)
         self._answers.robust_parsing = True
         self._simulator = dialect.MAVLink(None, options.system_id, 1)
@@ -126,6 +129,11 @@ class Px4Process(ABC):
     def said(self) -> Iterator[bytes]:
         """Yield what it has said to its companion."""
         self._sort()
+        if self._has_told:
+            # Its clock stands still until it has read that: as late as it was told, it takes
+            # the time for half of that earlier.
+            self._has_told = False
+            self.hear(())
         while self._unread:
             yield self._unread.popleft()
 
@@ -163,8 +171,10 @@ class Px4Process(ABC):
         except dialect.MAVError:
             return False
         if message.tc1 == 0 and self._tells_time:
-            answer_ns = max(1, message.ts1 + self._boot_ns)
-            self._write(dialect.MAVLink_timesync_message(answer_ns, message.ts1))
+            # It takes what it is told for the time halfway between its question and now.
+            halfway_ns = (message.ts1 + self._boot_ns + self.now_ns) // 2
+            self._write(dialect.MAVLink_timesync_message(max(1, halfway_ns), message.ts1))
+            self._has_told = True
             return True
         if message.tc1 != 0 and message.ts1 < 0:
             self._n_answered = max(self._n_answered, -message.ts1)

@@ -3,13 +3,14 @@
 Written after src/modules/simulation/simulator_mavlink: it finds its ports in the scripts that
 stand in its folder, answers each HIL_SENSOR by HIL_ACTUATOR_CONTROLS of its time, and asks for the
 time ten times a second. Its attitude is what its sensors say: level and north at first, turned on
-by its rates. Its position is the last that it was sent by VISION_POSITION_ESTIMATE, its height
-another; it has one only once it was told the time, at once.
+by its rates. Its position is the last that it was sent by VISION_POSITION_ESTIMATE; it has one
+only once it was told the time, at once. What it is told it reads at any time, as a thread does.
 """
 
 import math
 import os
 import re
+import select
 import socket
 import sys
 from pathlib import Path
@@ -18,7 +19,6 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from scipy.spatial.transform import Rotation
 
-HEIGHT_OFF_M = 1.5
 STARTS_AFTER = 5
 STEP_US = 4000
 ALIGNS_WITH = 200
@@ -87,7 +87,7 @@ def main() -> None:
             say(dialect.MAVLink_timesync_message(now_us * 1000, message.ts1))
         elif message.get_type() == "TIMESYNC":
             assert now_us * 1000 - message.ts1 <= 2 * STEP_US * 1000, "the time came late"
-            ahead_us = message.tc1 // 1000 - message.ts1 // 1000
+            ahead_us = message.tc1 // 1000 - (message.ts1 // 1000 + now_us) // 2
         elif message.get_type() == "VISION_POSITION_ESTIMATE" and ahead_us is not None:
             late_us = now_us + ahead_us - message.usec
             assert 0 <= late_us <= 400_000, late_us
@@ -105,14 +105,27 @@ def main() -> None:
             x, y, z, w = attitude.ned_from_body.as_quat()
             say(dialect.MAVLink_attitude_quaternion_message(boot_ms, w, x, y, z, 0, 0, 0))
             if position is not None:
-                x, y, z = position
+                say(dialect.MAVLink_local_position_ned_message(boot_ms, *position, 0, 0, 0))
                 say(
-                    dialect.MAVLink_local_position_ned_message(
-                        boot_ms, x, y, z + HEIGHT_OFF_M, 0, 0, 0
+                    dialect.MAVLink_odometry_message(
+                        now_us, 1, 12, *position, (1, 0, 0, 0), *[0.0] * 6, *[[0.0] * 21] * 2
                     )
                 )
 
+    def read() -> None:
+        while True:
+            try:
+                heard = mavlink.recv(65536)
+            except BlockingIOError:
+                return
+            for message in parser.parse_buffer(heard) or []:
+                hear(message)
+
     while True:
+        ready, _, _ = select.select([simulator, mavlink], [], [])
+        read()
+        if simulator not in ready:
+            continue
         data = simulator.recv(65536)
         if not data:
             return
@@ -125,13 +138,7 @@ def main() -> None:
             if count == dies_after:
                 sys.exit(4)
             attitude.feel(felt)
-            while True:
-                try:
-                    heard = mavlink.recv(65536)
-                except BlockingIOError:
-                    break
-                for message in parser.parse_buffer(heard) or []:
-                    hear(message)
+            read()
             live()
             if count > STARTS_AFTER:
                 answer = dialect.MAVLink_hil_actuator_controls_message(now_us, [0.0] * 16, 1, 1)

@@ -43,7 +43,6 @@ class Real:
         parameters: set before.
         variable: of the environment, that says where it is.
         booted_before_ns: how long it has run before the first pose.
-        has_own_height: whether its height is a barometer's, from where it was switched on.
         message: what it is sent.
     """
 
@@ -52,7 +51,6 @@ class Real:
     parameters: Mapping[str, float]
     variable: str
     booted_before_ns: int
-    has_own_height: bool
     message: Literal["vision_position_estimate", "odometry"] = "vision_position_estimate"
 
 
@@ -62,10 +60,9 @@ ARDUPILOT = Real(
     RECORDED,
     "VCL_ARDUPILOT",
     40_000_000_000,
-    has_own_height=False,
 )
 # By the first pose it has our clock.
-PX4 = Real("px4", px4.start, PX4_RECORDED, "VCL_PX4", 60_000_000_000, has_own_height=True)
+PX4 = Real("px4", px4.start, PX4_RECORDED, "VCL_PX4", 60_000_000_000)
 
 
 SYSTEM = 2
@@ -103,7 +100,6 @@ class Flight:
         true: RecordedMotion,
         origin: tuple[float, float, float] | None,
     ) -> None:
-        self._real = real
         self.clock = ManualClock(START_NS)
         link = f"udp:127.0.0.1:{port}"
         options = AutopilotOptions(link=link, message=real.message, origin=origin)
@@ -173,14 +169,9 @@ class Flight:
         return self.apart(fused)[1]
 
     def apart(self, fused: Path) -> tuple[NDArray[np.int64], Array]:
-        """Return (T,) instants of the last second, and how far it was then from where it was told.
-
-        Where its height is its own, that has to go as ours goes.
-        """
+        """Return (T,) instants of the last second, and how far it was from where it was told."""
         times, believed = self._lately(fused)
         apart = believed - self._true.at(times).positions_m - self.off
-        if self._real.has_own_height:
-            apart[:, 2] -= np.median(apart[:, 2])
         return times, np.asarray(np.linalg.norm(apart, axis=1))
 
     def _lately(self, fused: Path) -> tuple[NDArray[np.int64], Array]:

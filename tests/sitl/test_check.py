@@ -23,7 +23,7 @@ from tests.daemon import turned_by_hand as by_hand
 from vcl_companion.cli import main
 from vcl_companion.clock import SystemClock
 from vcl_companion.daemon.check_host import judge_frames
-from vcl_companion.daemon.parameter_rules import findings, rules_for
+from vcl_companion.daemon.parameter_rules import Finding, findings, rules_for
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
@@ -308,7 +308,7 @@ def test_an_autopilot_that_is_not_there_is_said_in_words(tmp_path: Path) -> None
 def test_each_parameter_that_is_wrong_is_found_alone(
     firmware: Firmware, right: Mapping[str, float], name: str, value: float, severity: str
 ) -> None:
-    rules = rules_for(firmware, sends_velocity=False)
+    rules = rules_for(firmware, sends_velocity=False, sets_origin=True)
     assert findings(rules, right) == []
     (found,) = findings(rules, {**right, name: value})
     assert (found.name, found.value, found.severity) == (name, value, severity)
@@ -318,11 +318,19 @@ def test_each_parameter_that_is_wrong_is_found_alone(
 
 
 def test_who_is_sent_odometry_may_fuse_its_velocity() -> None:
-    ardupilot = {**PARAMETERS, "EK3_SRC1_VELXY": 6.0}
-    assert findings(rules_for(Firmware.ARDUPILOT, sends_velocity=True), ardupilot) == []
-    px4 = {**PX4, "EKF2_EV_CTRL": 15.0}
-    assert findings(rules_for(Firmware.PX4, sends_velocity=True), px4) == []
-    assert rules_for(Firmware.OTHER, sends_velocity=False) == ()
+    def found(firmware: Firmware, values: Mapping[str, float]) -> list[Finding]:
+        return findings(rules_for(firmware, sends_velocity=True, sets_origin=False), values)
+
+    assert found(Firmware.ARDUPILOT, {**PARAMETERS, "EK3_SRC1_VELXY": 6.0}) == []
+    assert found(Firmware.PX4, {**PX4, "EKF2_EV_CTRL": 15.0}) == []
+    assert found(Firmware.OTHER, {}) == []
+
+
+def test_a_height_by_vision_is_a_danger_only_with_an_origin() -> None:
+    rules = rules_for(Firmware.PX4, sends_velocity=False, sets_origin=False)
+    (found,) = findings(rules, {**PX4, "EKF2_HGT_REF": 3.0})
+    assert (found.name, found.severity) == ("EKF2_HGT_REF", "warns")
+    assert "nobody may set one" in found.why
 
 
 @pytest.mark.parametrize(

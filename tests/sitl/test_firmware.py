@@ -232,8 +232,20 @@ def test_a_height_that_counts_from_elsewhere_is_judged_by_how_it_goes(tmp_path: 
     assert as_it_goes.ate_m == pytest.approx(0.1, abs=0.003)
 
 
-def test_px4_s_height_is_its_own_unless_vision_gives_it(build: Path) -> None:
-    assert parse_firmware(f"px4={build}").has_own_height
-    assert parse_firmware(f"px4={build}").holds_at_rest
-    assert not parse_firmware(f"px4={build}", ("EKF2_HGT_REF=3",)).has_own_height
-    assert not parse_firmware(f"ardupilot={build / 'bin' / 'px4'}").has_own_height
+@pytest.mark.parametrize(
+    ("kind", "given", "flies_itself", "has_own_height"),
+    [
+        ("px4", (), True, True),
+        ("px4", (), False, False),
+        ("px4", ("EKF2_HGT_REF=3",), True, False),
+        ("px4", ("EKF2_HGT_REF=0",), False, True),
+        ("ardupilot", (), True, False),
+    ],
+)
+def test_px4_s_height_is_its_own_unless_vision_gives_it(
+    build: Path, kind: str, given: tuple[str, ...], flies_itself: bool, has_own_height: bool
+) -> None:
+    path = build if kind == "px4" else build / "bin" / "px4"
+    firmware = parse_firmware(f"{kind}={path}", given)
+    assert firmware.has_own_height(flies_itself=flies_itself) == has_own_height
+    assert firmware.holds_at_rest == (kind == "px4")

@@ -22,6 +22,7 @@ class Listener:
     """A firmware that notes what it hears, and at which step."""
 
     estimator_message = dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT
+    position_message = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
 
     def __init__(self) -> None:
         self.now_ns = BEGINS_NS

@@ -156,7 +156,11 @@ async def of_autopilot(config: Config, link: AutopilotLink) -> tuple[list[Check]
     else:
         checks.append(Check("link", "ok", what))
     checks.append(_of_time(link))
-    rules = rules_for(link.firmware, sends_velocity=config.autopilot.message == "odometry")
+    rules = rules_for(
+        link.firmware,
+        sends_velocity=config.autopilot.message == "odometry",
+        sets_origin=config.autopilot.origin is not None,
+    )
     values = {}
     for name in names_of(rules):
         value = await link.parameter(name)

@@ -56,16 +56,19 @@ class Finding:
     why: str
 
 
-def rules_for(firmware: Firmware, *, sends_velocity: bool) -> tuple[Rule, ...]:
+def rules_for(firmware: Firmware, *, sends_velocity: bool, sets_origin: bool) -> tuple[Rule, ...]:
     """Return the rules of a firmware; none for one that is not known.
 
     Args:
         firmware: whose.
         sends_velocity: whether it is sent ODOMETRY.
+        sets_origin: whether it is told a global origin.
     """
     if firmware is Firmware.ARDUPILOT:
         return _ardupilot(sends_velocity=sends_velocity)
-    return _px4(sends_velocity=sends_velocity) if firmware is Firmware.PX4 else ()
+    if firmware is Firmware.PX4:
+        return _px4(sends_velocity=sends_velocity, sets_origin=sets_origin)
+    return ()
 
 
 def names_of(rules: tuple[Rule, ...]) -> tuple[str, ...]:
@@ -154,7 +157,7 @@ def _ardupilot(*, sends_velocity: bool) -> tuple[Rule, ...]:
     )  # fmt: skip
 
 
-def _px4(*, sends_velocity: bool) -> tuple[Rule, ...]:
+def _px4(*, sends_velocity: bool, sets_origin: bool) -> tuple[Rule, ...]:
     def takes_position(value: float) -> bool:
         return bool(int(value) & _EV_HPOS)
 
@@ -164,9 +167,11 @@ def _px4(*, sends_velocity: bool) -> tuple[Rule, ...]:
     used = float(_EV_HPOS | _EV_VPOS | _EV_YAW)
     return (
         Rule(
-            ("EKF2_HGT_REF",), "dangerous", lambda value: round(value) != 3, 0.0,
+            ("EKF2_HGT_REF",), "dangerous" if sets_origin else "warns",
+            lambda value: round(value) != 3, 0.0,
             "with vision (3) a global origin throws its height by that origin's altitude at the "
-            "next reset, and the drone climbs away",
+            "next reset, and the drone climbs away"
+            + ("" if sets_origin else ": nobody may set one, at a ground station neither"),
         ),
         *(
             Rule(
