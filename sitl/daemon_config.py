@@ -17,7 +17,8 @@ _FLAT_OUT_WAIT_S = 30.0
 # As exactly as a place is surveyed for a recording's truth. What a daemon takes for granted is a
 # tape's centimetre: of drones 3 m apart it makes poses 30 m away uncertain by 10 cm, and an
 # autopilot that is told of 10 cm follows them less than the drift of its own accelerometers.
-_TRUE_DISTANCE_SIGMA_M = 0.001
+TRUE_DISTANCE_SIGMA_M = 0.001
+"""How exactly a distance is known that is the truth's, m, 1 sigma."""
 # Autopilots in simulation have the cameras' clock. What is left are the steps in which their
 # estimators take poses in: anywhere within 10 ms (ArduPilot's EKF3).
 _TRUE_TIME_ERROR_S = 0.003
@@ -38,7 +39,7 @@ def daemon_config(
     calibration = plan.recording.path.resolve() / planned.name / CAMERA_FOLDER / "sensor.yaml"
     if planned.mission is not None:  # the recording is made as it flies
         calibration = run / "sensor.yaml"
-    exactness = {"distance_sigma_m": _TRUE_DISTANCE_SIGMA_M} if plan.are_distances_true else {}
+    exactness = {"distance_sigma_m": TRUE_DISTANCE_SIGMA_M} if plan.are_distances_true else {}
     wiring = {
         "system_id": planned.system_id,
         "clock": "camera",

@@ -102,10 +102,10 @@ _LATENCY_NOTE = (
 )
 
 _FUSED_NOTE = (
-    "The firmware's own position (LOCAL_POSITION_NED) against the truth, from two seconds after "
-    "the first pose and where its estimator says that it has one; ours beside it, as it was sent. "
-    "Of a height that is a barometer's, PX4's, it is how it goes that is judged: it counts from "
-    "where the drone was switched on. "
+    "The firmware's own position (ArduPilot's LOCAL_POSITION_NED, PX4's ODOMETRY) against the "
+    "truth, from two seconds after the first pose and where its estimator says that it has one; "
+    "ours beside it, as it was sent. Of a height that is a barometer's (a PX4's that flies by "
+    "itself) it is how it goes that is judged: it counts from where the drone was switched on. "
     "Ahead: its position is that of so much later an instant, as it takes our poses for so much "
     "older than they are; the firmware's parameter of their delay is too large by that."
 )

@@ -1,9 +1,9 @@
 """What a real firmware says of itself, written down for the report.
 
 ``attitude.csv``, where its nose points (ATTITUDE_QUATERNION); ``fused.csv``, where it believes to
-be (``at_ns,x,y,z`` of its position message); ``global.csv``, where on Earth, once it knows
-(``at_ns,latitude_deg,longitude_deg,altitude_m`` of GLOBAL_POSITION_INT); ``said.csv``, its texts
-and its estimator's flags.
+be (``at_ns,x,y,z`` of its position message, which PX4 sends before it has one, too);
+``global.csv``, where on Earth, once it knows (``at_ns,latitude_deg,longitude_deg,altitude_m`` of
+GLOBAL_POSITION_INT); ``said.csv``, its texts and its estimator's flags.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ class Px4Process(ABC):
     """
 
     estimator_message = dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS
-    # Its LOCAL_POSITION_NED has the instant at which it was said, a step late now and then.
+    # Its LOCAL_POSITION_NED bears the instant at which it was made, this that of the estimate.
     position_message = dialect.MAVLINK_MSG_ID_ODOMETRY
 
     def __init__(
@@ -97,6 +97,10 @@ class Px4Process(ABC):
 
     def step(self) -> None:
         """Move it on by one step of its clock, and wait until it has done what is due in it."""
+        while self._has_told:
+            # What it reads a step later it takes for the time half a step earlier.
+            self._has_told = False
+            self.hear(())
         message = self._reading()
         asked_at_s = time.monotonic()
         try:
@@ -129,11 +133,6 @@ class Px4Process(ABC):
     def said(self) -> Iterator[bytes]:
         """Yield what it has said to its companion."""
         self._sort()
-        if self._has_told:
-            # Its clock stands still until it has read that: as late as it was told, it takes
-            # the time for half of that earlier.
-            self._has_told = False
-            self.hear(())
         while self._unread:
             yield self._unread.popleft()
 

@@ -71,7 +71,10 @@ def test_a_px4_whose_clock_is_not_known_does_not_fuse() -> None:
 
 
 def test_a_px4_with_height_by_vision_is_warned_of_an_origin() -> None:
-    assert checks_of(12, {**PX4, "EKF2_HGT_REF": 3.0})["EKF2_HGT_REF"].grade == "warning"
+    checks = checks_of(12, {**PX4, "EKF2_HGT_REF": 3.0})
+    assert checks["origin"].grade == "warning"
+    assert "climbs away" in checks["origin"].what
+    assert "EKF2_HGT_REF" not in checks
 
 
 def test_a_px4_with_height_by_vision_gets_no_origin_and_fails() -> None:

@@ -4,7 +4,8 @@ Written after src/modules/simulation/simulator_mavlink: it finds its ports in th
 stand in its folder, answers each HIL_SENSOR by HIL_ACTUATOR_CONTROLS of its time, and asks for the
 time ten times a second. Its attitude is what its sensors say: level and north at first, turned on
 by its rates. Its position is the last that it was sent by VISION_POSITION_ESTIMATE; it has one
-only once it was told the time, at once. What it is told it reads at any time, as a thread does.
+only once it was told the time, at once. What it is told it reads at any time, as a thread does, but
+only when nobody moves its clock on meanwhile; its LOCAL_POSITION_NED is not its position.
 """
 
 import math
@@ -19,6 +20,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from scipy.spatial.transform import Rotation
 
+NOWHERE_M = 1.5
 STARTS_AFTER = 5
 STEP_US = 4000
 ALIGNS_WITH = 200
@@ -61,6 +63,7 @@ def main() -> None:
     os.chdir(folder)
     assert folder == os.environ["PATH"].split(":")[0]
     assert os.environ["PX4_PARAM_EKF2_EV_CTRL"] == "11"
+    assert os.environ["PX4_PARAM_EKF2_HGT_REF"] == "3"
     simulator_port = number_in(
         "px4-rc.mavlinksim", r"simulator_mavlink start -t 127\.0\.0\.1 (\d+)"
     )
@@ -87,7 +90,9 @@ def main() -> None:
             say(dialect.MAVLink_timesync_message(now_us * 1000, message.ts1))
         elif message.get_type() == "TIMESYNC":
             assert now_us * 1000 - message.ts1 <= 2 * STEP_US * 1000, "the time came late"
-            ahead_us = message.tc1 // 1000 - (message.ts1 // 1000 + now_us) // 2
+            told_us = message.tc1 // 1000 - (message.ts1 // 1000 + now_us) // 2
+            assert ahead_us in (None, told_us), (ahead_us, told_us)
+            ahead_us = told_us
         elif message.get_type() == "VISION_POSITION_ESTIMATE" and ahead_us is not None:
             late_us = now_us + ahead_us - message.usec
             assert 0 <= late_us <= 400_000, late_us
@@ -100,12 +105,19 @@ def main() -> None:
             flags, ratio = (0x25, math.nan) if position is None else (0x12F, 0.1)
             say(dialect.MAVLink_estimator_status_message(now_us, flags, 0, ratio, *[0.0] * 6))
         if count % 25 == 2:
-            say(dialect.MAVLink_timesync_message(0, now_us * 1000))
+            # Every other question was under way for a step.
+            asked_us = now_us - (count // 25 % 2) * STEP_US
+            say(dialect.MAVLink_timesync_message(0, asked_us * 1000))
         if count % 5 == 1 and attitude.ned_from_body is not None:
             x, y, z, w = attitude.ned_from_body.as_quat()
             say(dialect.MAVLink_attitude_quaternion_message(boot_ms, w, x, y, z, 0, 0, 0))
             if position is not None:
-                say(dialect.MAVLink_local_position_ned_message(boot_ms, *position, 0, 0, 0))
+                x, y, z = position
+                say(
+                    dialect.MAVLink_local_position_ned_message(
+                        boot_ms, x, y, z + NOWHERE_M, 0, 0, 0
+                    )
+                )
                 say(
                     dialect.MAVLink_odometry_message(
                         now_us, 1, 12, *position, (1, 0, 0, 0), *[0.0] * 6, *[[0.0] * 21] * 2
@@ -123,8 +135,8 @@ def main() -> None:
 
     while True:
         ready, _, _ = select.select([simulator, mavlink], [], [])
-        read()
-        if simulator not in ready:
+        if simulator not in ready and simulator not in select.select([simulator], [], [], 1e-3)[0]:
+            read()
             continue
         data = simulator.recv(65536)
         if not data:

@@ -328,9 +328,9 @@ def test_who_is_sent_odometry_may_fuse_its_velocity() -> None:
 
 def test_a_height_by_vision_is_a_danger_only_with_an_origin() -> None:
     rules = rules_for(Firmware.PX4, sends_velocity=False, sets_origin=False)
-    (found,) = findings(rules, {**PX4, "EKF2_HGT_REF": 3.0})
-    assert (found.name, found.severity) == ("EKF2_HGT_REF", "warns")
-    assert "nobody may set one" in found.why
+    assert findings(rules, {**PX4, "EKF2_HGT_REF": 3.0}) == []
+    (found,) = findings(rules, {key: value for key, value in PX4.items() if key != "EKF2_HGT_REF"})
+    assert (found.name, found.value) == ("EKF2_HGT_REF", None)
 
 
 @pytest.mark.parametrize(

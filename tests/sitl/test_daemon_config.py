@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl.daemon_config import daemon_config, toml_text, with_settings
+from sitl.daemon_config import TRUE_DISTANCE_SIGMA_M, daemon_config, toml_text, with_settings
 from sitl.plan import FlyOptions, Setting, plan_flight
 from tests.sitl.flights import Flight, write_recording
 from vcl_companion.errors import ConfigError
@@ -49,7 +49,7 @@ def test_a_later_setting_wins_and_the_base_is_left_alone() -> None:
         with_settings(base, [Setting(("log", "level", "deeper"), 1)])
 
 
-@pytest.mark.parametrize(("metres", "told_m"), [(None, 0.001), (2.0, None)])
+@pytest.mark.parametrize(("metres", "told_m"), [(None, TRUE_DISTANCE_SIGMA_M), (2.0, None)])
 def test_a_distance_of_the_truth_s_is_told_as_exact(
     tmp_path: Path, metres: float | None, told_m: float | None
 ) -> None:

@@ -12,10 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from sitl.autopilots.attitude_source import read_table
 from sitl.autopilots.firmware_options import read_options
+from sitl.autopilots.px4_parameters import RECORDED, of_a_mission
 from sitl.evaluation import Estimates
 from sitl.firmware import FirmwareBinary, parse_firmware
 from sitl.fly import fly
 from sitl.fused import read_fused
+from sitl.mission import Mission
 from sitl.plan import FlyOptions
 from vcl_companion.daemon.status import read_status
 from vcl_companion.errors import ConfigError, VclError
@@ -245,6 +247,9 @@ def test_a_height_that_counts_from_elsewhere_is_judged_by_how_it_goes(tmp_path: 
 def test_px4_s_height_is_its_own_unless_vision_gives_it(
     build: Path, kind: str, given: tuple[str, ...], flies_itself: bool, has_own_height: bool
 ) -> None:
+    if kind == "px4" and not given:
+        usual = of_a_mission(Mission((0, 0, 0), ())) if flies_itself else RECORDED
+        assert (usual["EKF2_HGT_REF"] != 3.0) == has_own_height
     path = build if kind == "px4" else build / "bin" / "px4"
     firmware = parse_firmware(f"{kind}={path}", given)
     assert firmware.has_own_height(flies_itself=flies_itself) == has_own_height

@@ -21,6 +21,7 @@ import pytest
 from click.testing import CliRunner
 
 from sitl.__main__ import main
+from sitl.daemon_config import TRUE_DISTANCE_SIGMA_M
 from tests.whole_lines import json_lines
 from vcl_companion.recording import Description, RecordingWriter, read_recording
 from vcl_companion.recording.tum import read_tum
@@ -216,7 +217,7 @@ def test_nothing_of_the_truth_reaches_a_daemon(
         shutil.rmtree(blind / name / "state_groundtruth_estimate0")
     distance_m = report_in(flown)["options"]["known_distances_m"]
     known = [f"--known-distance={pair}={metres!r}" for pair, metres in distance_m.items()]
-    known.append("--set=map.distance_sigma_m=0.002")  # nobody measured them
+    known.append(f"--set=map.distance_sigma_m={TRUE_DISTANCE_SIGMA_M}")  # nobody measured them
     out = tmp_path / "again"
     done = sitl_fly(blind, "--out", out, "--speed", "max", "--attitude", flown, *known)
     assert done.returncode == 0, done.stderr

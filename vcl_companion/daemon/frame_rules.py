@@ -34,7 +34,10 @@ def of_frames(
     by_vision = round(values.get(HEIGHT_REFERENCE, 0.0)) == HEIGHT_BY_VISION
     if firmware is Firmware.PX4 and by_vision and options.origin is not None:
         what = f"it is not told: with {HEIGHT_REFERENCE} 3 (vision) it would climb away"
-        yield Check("origin", "failure", what, f"set {HEIGHT_REFERENCE} to 1, or no origin")
+        yield Check("origin", "failure", what, f"set {HEIGHT_REFERENCE} to 0, or no origin")
+    elif firmware is Firmware.PX4 and by_vision:
+        what = f"with {HEIGHT_REFERENCE} 3 (vision) it climbs away when a ground station sets one"
+        yield Check("origin", "warning", what, f"have nobody set one, or {HEIGHT_REFERENCE} 0")
 
 
 def _turns_to_us(firmware: Firmware, values: Mapping[str, float]) -> bool | None:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from vcl_companion.links.origin import HEIGHT_BY_VISION, HEIGHT_REFERENCE
 from vcl_companion.links.vision_pose import Firmware
 
 Severity = Literal["prevents", "dangerous", "warns"]
@@ -164,14 +165,15 @@ def _px4(*, sends_velocity: bool, sets_origin: bool) -> tuple[Rule, ...]:
     def takes_no_velocity(value: float) -> bool:
         return sends_velocity or not int(value) & _EV_VEL
 
+    def is_safe(height_reference: float) -> bool:
+        return not sets_origin or round(height_reference) != HEIGHT_BY_VISION
+
     used = float(_EV_HPOS | _EV_VPOS | _EV_YAW)
     return (
         Rule(
-            ("EKF2_HGT_REF",), "dangerous" if sets_origin else "warns",
-            lambda value: round(value) != 3, 0.0,
+            (HEIGHT_REFERENCE,), "dangerous", is_safe, 0.0,
             "with vision (3) a global origin throws its height by that origin's altitude at the "
-            "next reset, and the drone climbs away"
-            + ("" if sets_origin else ": nobody may set one, at a ground station neither"),
+            "next reset, and the drone climbs away",
         ),
         *(
             Rule(
