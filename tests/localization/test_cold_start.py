@@ -75,7 +75,9 @@ def test_the_first_image_is_enough(scenery: Scenery, place: str, north: bool) ->
     fix = localize(image, PINHOLE, MOUNTING, index, templates, None, attitude, OPTIONS)
     assert isinstance(fix, Localized), fix.reason
     assert fix.by == "patches"
-    assert_pose_close(fix.world_from_body, truth, within_m=0.02, within_rad=1e-3)
+    # The farther the wall, the less its patches tell a step aside from a turn.
+    farther = max(1.0, (16.0 - truth.translation[0]) / 16.0)
+    assert_pose_close(fix.world_from_body, truth, within_m=0.02 * farther, within_rad=1e-3)
     assert nees(truth.local(fix.world_from_body), fix.covariance())[0] < 22.5
     estimator = Estimator(FilterOptions(), OPTIONS.localization, lambda _: None)
     assert isinstance(estimator.take_fix(None, fix, 0, attitude), FilterState)

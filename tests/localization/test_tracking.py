@@ -224,6 +224,26 @@ def test_a_lens_that_is_off_does_not_average_out(
     assert own[1] < 20.0
 
 
+def test_what_is_seen_where_a_keyframe_saw_it_is_shifted_no_more_than_there(
+    rng: np.random.Generator, templates: Templates
+) -> None:
+    """The farther the patches lie from where they were cut out, the more a lens may be off."""
+    keyframe = BODIES[0]
+    sigmas = []
+    for turned in (0.0, 0.02, 0.2):
+        truth = Pose(keyframe.rotation @ exp_so3(np.array([0, 0, turned])), keyframe.translation)
+        own = []
+        for shifted_px in (1e-6, 0.1):
+            options = replace(OPTIONS, shifted_px=shifted_px)
+            image, prior = photograph(truth, np.random.default_rng(3)), near(rng, truth)
+            fix = tracked(image, templates, prior, options=options)
+            own.append(fix.own_map_covariance[5, 5])
+        sigmas.append(float(np.sqrt(own[1] - own[0])) * PINHOLE.focal_px)
+    assert sigmas[0] < 0.005
+    assert 0.01 < sigmas[1] < 0.08
+    assert abs(sigmas[2] - 0.1) < 0.01
+
+
 def test_few_landmarks_are_as_many_as_wanted(
     rng: np.random.Generator, templates: Templates
 ) -> None:

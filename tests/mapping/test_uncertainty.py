@@ -16,9 +16,10 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import KnownDistance, LandmarkMap
 from vcl_companion.mapping.uncertainty import (
+    ASIDE_DEG,
+    ASIDE_NOISE_PX,
     REPEATED_NOISE_PX,
     SHARED_NOISE_PX,
-    SHARED_NOISE_PX_PER_DEG,
     map_uncertainty,
     shared_noise_px,
     views_of,
@@ -44,7 +45,8 @@ def dense_covariance(landmark_map: LandmarkMap, looks_before: Array | float = 0.
         turned = np.linalg.norm(np.cross(units[k], mean)), units[k] @ mean
         aside_deg[j, k] = np.rad2deg(np.arctan2(*turned))
     repeated = REPEATED_NOISE_PX * np.sqrt(np.asarray(looks_before)) * np.ones(aside_deg.shape)
-    parts = (SHARED_NOISE_PX, SHARED_NOISE_PX_PER_DEG * aside_deg, landmark_map.pixel_noise_px)
+    aside_px = ASIDE_NOISE_PX * (aside_deg / ASIDE_DEG) ** 1.5
+    parts = (SHARED_NOISE_PX, aside_px, landmark_map.pixel_noise_px)
     noise = np.sqrt(repeated**2 + sum(np.square(part) for part in parts))[..., None, None]
     views = views_of(landmark_map)
     system = normal_equations(replace(views, slopes=views.slopes / noise), None)

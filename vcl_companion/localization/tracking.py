@@ -41,6 +41,8 @@ _SINGULAR = 1e-9
 _MAX_ROUNDS = 3
 # Patches warped and begun so near to where they are need no second look.
 _WELL_PREDICTED_PX = 0.5
+# Patches that lie so far from where they are in their keyframes are shifted as much as any.
+_SHIFTED_WHOLLY_PX = 40.0
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ class TrackingOptions:
         misplaced_by_residual: per sigma that the residual of the grey levels explains.
         shifted_px: what all alignments of an image are off together, in each direction: no lens
             is known better, nor what a patch's surface, its light and an encoder do to it. However
-            many landmarks there are, this does not average out.
+            many landmarks there are, this does not average out. Of patches that are found nearly
+            where they are in their keyframes all that is alike: there it is less.
     """
 
     n_landmarks: int = 400
@@ -291,7 +294,7 @@ class _Tracker:
         fix = Localized(
             pose,
             _ROBUST_LOSS * by_noise,
-            _ROBUST_LOSS * by_misplacement + by_landmarks + self._by_shift(),
+            _ROBUST_LOSS * by_misplacement + by_landmarks + self._by_shift(found.of(agrees)),
             lever,
             uncertainty.keyframe_covariance,
             n_tried,
@@ -306,12 +309,13 @@ class _Tracker:
         )
         return believed(fix, ned_from_body, self._belief)
 
-    def _by_shift(self) -> Array:
+    def _by_shift(self, found: Alignment) -> Array:
         """Return the pose's (6, 6) covariance by a shift of the whole image: the camera, turned."""
+        moved_px = np.linalg.norm(found.pixels - self._anchors.pixels[found.anchors], axis=1)
+        share = min(float(np.median(moved_px)) / _SHIFTED_WHOLLY_PX, 1.0)
         turned = adjoint(self._mounting)[:, 3:5]
-        return np.asarray(
-            (self._options.shifted_px / self._camera.focal_px) ** 2 * turned @ turned.T
-        )
+        shifted_rad = share * self._options.shifted_px / self._camera.focal_px
+        return np.asarray(shifted_rad**2 * turned @ turned.T)
 
     def _novelty_deg(self, anchors: NDArray[np.int64], pose: Pose) -> float:
         centres = self._anchors.images.centres

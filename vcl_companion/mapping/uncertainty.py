@@ -27,14 +27,17 @@ from vcl_companion.vision.schur import carried, eliminated
 # landmarks of little parallax leaves 1e-12 by rounding.
 _SINGULAR = 1e-11
 # What displaces a feature or a patch is alike in neighbouring ones, so that residuals tell too
-# little of it: it acts on keyframes like so much more independent noise, and the more so, the
-# farther aside of the others a view is. And from one look at a landmark to the next it does not
-# change its sign: a further one tells the less, the more rounds have seen it before. Keyframes'
-# NEES is so on rendered flights and on photographs.
-SHARED_NOISE_PX = 0.25
-SHARED_NOISE_PX_PER_DEG = 0.03
-REPEATED_NOISE_PX = 0.44
-_WIDER = 1.5
+# little of it: it acts on keyframes like so much more independent noise. There is hardly any
+# between like views, and the more, the farther aside of the others one is: not in proportion, for
+# what stands out, and what a surface mirrors, are then seen otherwise altogether. And from one look
+# at a landmark to the next it does not change its sign: a further one tells the less, the more
+# rounds have seen it before. Poses' NEES is so on rendered flights and on photographs.
+SHARED_NOISE_PX = 0.1
+ASIDE_NOISE_PX = 0.3
+"""At ``ASIDE_DEG``; elsewhere by the power of 1.5 of the angle."""
+ASIDE_DEG = 10.0
+REPEATED_NOISE_PX = 0.35
+_WIDER = 2.4
 # No distance between drones is known better; much smaller sigmas overflow.
 _FINEST_M = 1e-6
 # So many landmarks are dealt with at a time: on its way what is known of one takes ten times the
@@ -153,7 +156,7 @@ def shared_noise_px(landmark_map: LandmarkMap) -> Array:
     for i, k in enumerate(rounds):
         in_round[:, k] |= seen[:, i]
     before = (np.cumsum(in_round, axis=1) - in_round)[:, rounds]
-    aside_px = SHARED_NOISE_PX_PER_DEG * _aside_deg(landmark_map)
+    aside_px = ASIDE_NOISE_PX * (_aside_deg(landmark_map) / ASIDE_DEG) ** 1.5
     return np.asarray(np.sqrt(SHARED_NOISE_PX**2 + aside_px**2 + REPEATED_NOISE_PX**2 * before))
 
 
