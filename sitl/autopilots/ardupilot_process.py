@@ -30,6 +30,7 @@ class ArduCopterProcess:
 
     estimator_message = dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT
     position_message = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
+    clock_ahead_ns: int | None = None
 
     def __init__(self, options: FirmwareOptions, wire: Wire, stack: ExitStack) -> None:
         self.now_ns = options.boot_offset_ns

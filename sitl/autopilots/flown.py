@@ -44,11 +44,13 @@ class Firmware(Protocol):
         now_ns: the instant of the recording that it has come to.
         estimator_message: id of the message that has its estimator's flags.
         position_message: id of the one that has its position, and its instant.
+        clock_ahead_ns: its clock minus the recording's; None: as it answers who asks for it.
     """
 
     now_ns: int
     estimator_message: int
     position_message: int
+    clock_ahead_ns: int | None
 
     def is_due(self, until_ns: int) -> bool:
         """Return whether one more step is to be done until an instant."""
@@ -105,7 +107,9 @@ class Flown:
         self._hearing = Hearing(received)
         self.wire = Wire(stack)
         self._firmware = start(options, self.wire, stack)
-        self._noting = Noting(options.out, self._firmware.position_message, stack)
+        self._noting = Noting(
+            options.out, self._firmware.position_message, self._firmware.clock_ahead_ns, stack
+        )
         self._parser = dialect.MAVLink(None)
         self._parser.robust_parsing = True
         self._ground = dialect.MAVLink(None, _GROUND_SYSTEM, _GROUND_COMPONENT)

@@ -24,11 +24,15 @@ class Noting:
     Args:
         out: the folder of the files.
         position_message: id of the one that has its position: LOCAL_POSITION_NED, or ODOMETRY.
+        clock_ahead_ns: its clock minus the recording's; None: to be learned from what it answers.
         stack: closes them.
     """
 
-    def __init__(self, out: Path, position_message: int, stack: ExitStack) -> None:
+    def __init__(
+        self, out: Path, position_message: int, clock_ahead_ns: int | None, stack: ExitStack
+    ) -> None:
         self._position_message = position_message
+        self._known_ahead_ns = clock_ahead_ns
 
         def opened(name: str, head: str) -> TextIO:
             file = stack.enter_context((out / name).open("w", buffering=1))
@@ -47,8 +51,11 @@ class Noting:
         """Take down one of its messages, read at an instant of the recording."""
         kind = message.get_type()
         if kind == "TIMESYNC" and message.tc1 != 0:
-            # It answers within a step or a few: the longest lead is the truest.
-            ahead_ns = message.tc1 - now_ns
+            # It answers within a step or a few: the longest lead is the truest, and still a step
+            # short where each answer is read a step after it was given.
+            ahead_ns = self._known_ahead_ns
+            if ahead_ns is None:
+                ahead_ns = message.tc1 - now_ns
             if self.clock_ahead_ns is None or ahead_ns > self.clock_ahead_ns:
                 self.clock_ahead_ns = ahead_ns
         elif kind == "STATUSTEXT":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sitl.autopilots.hil_sensors import PERIOD_US
 from sitl.mission import Mission
 
 _VISION_ALONE = {
@@ -17,8 +18,17 @@ _VISION_ALONE = {
     # Nobody reads its log.
     "SDLOG_MODE": -1.0,
 }
-# Height is ours too: nobody tells it a global origin.
-RECORDED = {**_VISION_ALONE, "EKF2_HGT_REF": 3.0}
+RECORDED = {
+    **_VISION_ALONE,
+    # Height is ours too: nobody tells it a global origin.
+    "EKF2_HGT_REF": 3.0,
+    # It takes a pose for one of the nearest end of its estimator's steps (EstimatorInterface's
+    # setExtVisionData moves it by half a step, RingBuffer's pop_first_older_than does the rest).
+    # A step is 10 ms by default, which comes to two readings of its sensors: frames that are whole
+    # multiples of those apart are all flight long taken for 4 ms too early, too late, or for
+    # right, by which reading it began with. One reading a step.
+    "EKF2_PREDICT_US": float(PERIOD_US),
+}
 
 
 def of_a_mission(mission: Mission) -> dict[str, float]:

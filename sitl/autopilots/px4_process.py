@@ -71,6 +71,8 @@ class Px4Process(ABC):
         self._wire = wire
         self._tells_time = tells_time
         self.now_ns = options.boot_offset_ns
+        # Its clock is what HIL_SENSOR says (SimulatorMavlink.cpp, handle_message_hil_sensor).
+        self.clock_ahead_ns: int | None = -options.boot_offset_ns
         self._controls: Array = np.zeros(_N_MOTORS)  # what it last had its motors do, 0 to 1
         self._boot_ns = options.boot_offset_ns
         self._rng = np.random.default_rng(options.system_id)

@@ -87,7 +87,9 @@ def main() -> None:
     def hear(message: dialect.MAVLink_message) -> None:
         nonlocal position, ahead_us
         if message.get_type() == "TIMESYNC" and message.tc1 == 0:
-            say(dialect.MAVLink_timesync_message(now_us * 1000, message.ts1))
+            # What the ground asked after a step was answered before the clock went on.
+            then_us = now_us - (STEP_US if message.ts1 > 0 else 0)
+            say(dialect.MAVLink_timesync_message(then_us * 1000, message.ts1))
         elif message.get_type() == "TIMESYNC":
             assert now_us * 1000 - message.ts1 <= 2 * STEP_US * 1000, "the time came late"
             told_us = message.tc1 // 1000 - (message.ts1 // 1000 + now_us) // 2

@@ -19,6 +19,7 @@ from sitl.fly import fly
 from sitl.fused import read_fused
 from sitl.mission import Mission
 from sitl.plan import FlyOptions
+from tests.whole_lines import whole_lines
 from vcl_companion.daemon.status import read_status
 from vcl_companion.errors import ConfigError, VclError
 from vcl_companion.geometry.pose import Pose
@@ -103,6 +104,14 @@ def test_a_flight_moves_px4_s_sensors_and_hands_it_our_poses_and_the_time(
         turned = Rotation.from_quat(np.roll(measured[1], -1, axis=1)[-1])
         off = turned.inv() * Rotation.from_quat(np.roll(true[1][:, 3:], -1, axis=1)[-1])
         assert np.rad2deg(off.magnitude()) < 1.5
+        # It says where it is in the first of each five of its steps.
+        config = json.loads((tmp_path / "out" / "run" / name / "stand_in.json").read_text())
+        said_ns = [
+            int(line.split(",")[0])
+            for line in whole_lines(tmp_path / "out" / name / "fused.csv")[1:]
+        ]
+        since_ns = np.array(said_ns) - config["boot_offset_ns"]
+        assert set(since_ns % 20_000_000) == {4_000_000}
 
 
 def test_a_folder_without_px4_s_scripts_ends_the_flight_in_one_line(

@@ -23,6 +23,7 @@ class Listener:
 
     estimator_message = dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT
     position_message = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
+    clock_ahead_ns: int | None = None
 
     def __init__(self) -> None:
         self.now_ns = BEGINS_NS

@@ -20,6 +20,7 @@ from sitl.autopilots.firmware_options import FirmwareOptions
 from sitl.autopilots.flown import Firmware
 from sitl.autopilots.motion import RecordedMotion
 from sitl.autopilots.px4_parameters import RECORDED
+from sitl.autopilots.px4_process import STEP_NS
 from sitl.autopilots.wire import Wire
 from tests.sitl.real_firmware import (
     ARDUPILOT,
@@ -159,6 +160,26 @@ def test_px4_takes_our_instants_once_we_have_told_it_the_time(tmp_path: Path) ->
         assert flight.states == [FusionState.FUSED]
 
     flown(replace(PX4, start=start, booted_before_ns=25_000_000_000), tmp_path, scenario)
+
+
+@pytest.mark.skipif(not os.environ.get("VCL_PX4"), reason="VCL_PX4 names no firmware")
+@pytest.mark.parametrize("steps", range(3))
+def test_px4_is_neither_ahead_nor_behind_whichever_of_its_steps_our_poses_fall_in(
+    tmp_path: Path, steps: int
+) -> None:
+    behind_s: list[float] = []
+
+    async def scenario(flight: Flight, fused: Path) -> None:
+        await flight.fly(6.0)
+        for _ in range(12):
+            await flight.fly(1.0)
+            behind_s.append(flight.behind_s(fused))
+
+    booted_before_ns = PX4.booted_before_ns + steps * STEP_NS
+    flown(replace(PX4, booted_before_ns=booted_before_ns), tmp_path, scenario)
+    # A step is 4 ms: less than half of one, of which the one second's noise may be half.
+    assert abs(np.mean(behind_s)) < 0.001, behind_s
+    assert np.abs(behind_s).max() < 0.003, behind_s
 
 
 @pytest.mark.skipif(not os.environ.get("VCL_ARDUPILOT"), reason="VCL_ARDUPILOT names no firmware")
