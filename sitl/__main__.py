@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from sitl.commands.flying import fly, live
-from sitl.commands.measuring import bench, paper, scale, torture
+from sitl.commands.measuring import bench, consistency, paper, scale, torture
 from sitl.commands.recordings import import_, render
 from vcl_companion.errors import VclError
 
@@ -33,7 +33,7 @@ def main() -> None:
     """Fly a swarm in software: real daemons, stand-in autopilots, recorded or rendered images."""
 
 
-for command in (fly, live, render, paper, bench, torture, scale, import_):
+for command in (fly, live, render, paper, bench, torture, scale, consistency, import_):
     main.add_command(command)
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What takes long: ``paper``, ``bench``, ``torture``, ``scale``."""
+"""What takes long: ``paper``, ``bench``, ``torture``, ``scale``, ``consistency``."""
 
 from __future__ import annotations
 
@@ -228,3 +228,50 @@ def scale(drones: str, loss: float, seed: int, out: Path) -> None:
     from sitl.scale.command import ScaleOptions, parse_drones, run_scale
 
     run_scale(out, ScaleOptions(parse_drones(drones), loss, seed), Console())
+
+
+@click.command()
+@click.argument("recordings", nargs=-1, required=True, metavar="RECORDING...", type=FOLDER)
+@click.option(
+    "--starts",
+    default=8,
+    show_default=True,
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Instants of each recording that maps are begun at, at most.",
+)
+@click.option(
+    "--extensions",
+    default=5,
+    show_default=True,
+    type=click.IntRange(min=0),
+    metavar="N",
+    help="Of each map, at most.",
+)
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
+@click.option(
+    "--out", default=Path("out/consistency"), show_default=True, metavar="DIR", type=FOLDER
+)
+def consistency(
+    recordings: tuple[Path, ...], starts: int, extensions: int, seed: int, out: Path
+) -> None:
+    """Measure whether maps and poses err as much as they say, by many maps of each RECORDING.
+
+    A flight is one draw of its map's error. Here maps are begun at many instants of a
+    recording and extended from there, and frames are followed on them, without daemons and as
+    fast as can be: a minute for ten maps. Leaves consistency.md and consistency.json in the
+    output folder. Exit status: 0, whatever was measured; 2 for input that cannot be used.
+    """
+    # One thread for everybody: this counts before numpy is loaded.
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    from rich.console import Console
+
+    from sitl.consistency.command import ConsistencyOptions
+    from sitl.consistency.command import consistency as measured
+    from sitl.consistency.report import show_consistency
+
+    console = Console()
+    options = ConsistencyOptions(starts, extensions, seed)
+    report = measured(recordings, out, options, lambda text: console.out(text, highlight=False))
+    show_consistency(console, report, out)

@@ -1,0 +1,215 @@
+"""Maps begun at an instant of a recording and extended from there, by the daemons' own workshop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sitl.daemon_config import TRUE_DISTANCE_SIGMA_M
+from vcl_companion.daemon.map_offer import MapOffer, ReadyMap
+from vcl_companion.daemon.workshop import WorkOptions, Workshop
+from vcl_companion.errors import RecordingError
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import exp_so3, quaternion_from_matrix
+from vcl_companion.localization.detail import Detail, needed_detail
+from vcl_companion.localization.intra import LocalizationOptions, Localized, Prior
+from vcl_companion.localization.pipeline import PipelineOptions
+from vcl_companion.localization.tracking import TrackingOptions, track
+from vcl_companion.mapping.options import MapOptions, NoMap
+from vcl_companion.recording import Drone, Recording
+from vcl_companion.recording.images import load_image
+from vcl_companion.swarm.pose_requests import InterMavOptions
+from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.vision.features import FeatureOptions, Image
+from vcl_companion.wire.frame_codec import FrameAnswer
+from vcl_companion.wire.header import BlobKind
+
+_MAPPING = MapOptions(distance_sigma_m=TRUE_DISTANCE_SIGMA_M)
+_PIPELINE = PipelineOptions(FeatureOptions(), LocalizationOptions(), TrackingOptions())
+_UPDATES = UpdateOptions()
+_ATTITUDE_DEG = 0.3
+# A prediction as a filter's between frames, 1 sigma; it is told as twice that.
+_PREDICTED = np.array([0.02] * 3 + [0.002] * 3)
+# Drones want an update where it would become so; one that takes no time comes then.
+_NOVELTY_DEG = 1.6 * _UPDATES.novelty_deg
+_MOST_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A frame of a drone, and what was found of it on a map.
+
+    Attributes:
+        drone: index in the recording.
+        revision: how many times the map had been extended.
+        true: world_from_body, by the truth.
+        fix: by the map's patches; None where they did not tell.
+    """
+
+    drone: int
+    revision: int
+    true: Pose
+    fix: Localized | None
+
+
+class Chain:
+    """The maps of a flight that begins at one of a recording's instants.
+
+    Args:
+        recording: each drone with its truth.
+        begins: index of the leader's frame that it begins with.
+        seed: of the attitudes' and the predictions' errors.
+        novelty_deg: how newly a map looks before it is extended.
+
+    Raises:
+        RecordingError: a drone has no truth there, or there is no known distance.
+    """
+
+    def __init__(
+        self, recording: Recording, begins: int, seed: int, novelty_deg: float = _NOVELTY_DEG
+    ) -> None:
+        self._drones = recording.drones
+        self._leader = [drone.name for drone in recording.drones].index(recording.leader)
+        self._instants = [frame.at_ns for frame in recording.drone(recording.leader).frames]
+        self._at = begins
+        self._rng = np.random.default_rng([seed, begins])
+        ids = {drone.name: i + 1 for i, drone in enumerate(recording.drones)}
+        if not recording.known_distances:
+            raise RecordingError(f"{recording.path}: no known_distance: maps would have no scale")
+        apart = tuple(
+            (ids[pair.a], ids[pair.b], self._apart_m(ids[pair.a] - 1, ids[pair.b] - 1))
+            for pair in recording.known_distances
+        )
+        options = WorkOptions(
+            apart, _MAPPING, _PIPELINE, _MAPPING.detectors, InterMavOptions(), tracked=True
+        )
+        self._workshop = Workshop(recording.drones[0].sensor, options)
+        self._map: ReadyMap | None = None
+        self._world_from_ned = Pose.identity()
+        self._novelty_deg = novelty_deg
+        self._n_extensions = 0
+        self._most = [0] * len(recording.drones)
+        self.ended = ""
+        """Why there are no more maps."""
+
+    def looks(self, step: int, n_extensions: int) -> Iterator[Look]:
+        """Fly on, every so many frames of the leader's, until so many extensions are done with.
+
+        The map is extended where most drones see too little of it or see it from afar, as a
+        flight's is; the frames until then are looked for on it.
+        """
+        if not self._begun():
+            return
+        while self._at + step < len(self._instants):
+            self._at += step
+            looks = [self._look(i) for i in range(len(self._drones))]
+            yield from looks
+            if 2 * sum(map(self._is_wanted, looks)) <= len(looks):
+                continue
+            if self._n_extensions == n_extensions or not self._extended(looks):
+                return
+
+    def _begun(self) -> bool:
+        made = self._workshop.first_map(
+            [self._answer(i, None) for i in range(len(self._drones))], self._leader + 1
+        )
+        if isinstance(made, NoMap):
+            self.ended = made.reason
+            return False
+        self._map = self._ready(self._workshop.encoded(made, b"").data)
+        # The leader's body is where the world begins.
+        first = self._map.index.landmark_map.keyframes[0].world_from_body
+        self._world_from_ned = first @ self._truth(self._leader).inverse()
+        return True
+
+    def _extended(self, looks: list[Look]) -> bool:
+        stored = self._current.stored()
+        frames = [self._answer(look.drone, look.fix) for look in looks]
+        made = self._workshop.next_revision(stored.revision, frames, at_once=False)
+        if isinstance(made, NoMap):
+            self.ended = made.reason
+            return False
+        self._map = self._ready(self._workshop.encoded(made, stored.revision).data)
+        self._n_extensions += 1
+        self._most = [0] * len(self._most)
+        return True
+
+    @property
+    def _current(self) -> ReadyMap:
+        if self._map is None:
+            raise RuntimeError("there is no map yet")
+        return self._map
+
+    def _ready(self, data: bytes) -> ReadyMap:
+        current = b"" if self._map is None else self._map.stored().revision
+        return self._workshop.ready(MapOffer.of(BlobKind.MAP, data), current, {})
+
+    def _look(self, i: int) -> Look:
+        """Find a drone's frame from where a filter may put it."""
+        drone, templates = self._drones[i], self._current.templates
+        true = self._world_from_ned @ self._truth(i)
+        if templates is None:
+            raise RuntimeError("a map is not ready to be tracked")
+        prior = Prior(
+            true.retracted(_PREDICTED * self._rng.standard_normal(6)),
+            np.diag((2.0 * _PREDICTED) ** 2),
+        )
+        fix = track(
+            self._image(i), drone.sensor.camera, drone.sensor.body_from_cam, templates, prior,
+            None, _PIPELINE.tracking, _PIPELINE.localization,
+        )  # fmt: skip
+        return Look(i, self._n_extensions, true, fix if isinstance(fix, Localized) else None)
+
+    def _is_wanted(self, look: Look) -> bool:
+        """Whether a drone wants the map extended (``swarm.updates``, without foresight)."""
+        fix, i = look.fix, look.drone
+        if fix is None:
+            return True
+        self._most[i] = max(self._most[i], min(fix.n_seen, _UPDATES.enough))
+        return (
+            fix.n_seen < max(_UPDATES.tracked, _UPDATES.share * self._most[i])
+            or fix.novelty_deg > self._novelty_deg
+        )
+
+    def _answer(self, i: int, fix: Localized | None) -> FrameAnswer:
+        """Return what a drone gives of its frame for a map."""
+        drone, image = self._drones[i], self._image(i)
+        detail: Detail = "all"
+        if self._map is not None:
+            landmark_map = self._map.index.landmark_map
+            sensor = drone.sensor
+            detail = needed_detail(fix, landmark_map, sensor.camera, sensor.body_from_cam)
+        noise = exp_so3(np.deg2rad(_ATTITUDE_DEG) * self._rng.standard_normal(3))
+        answer = FrameAnswer(
+            i + 1, 1, self._frame_ns(i), 0.0,
+            quaternion_from_matrix(self._truth(i).rotation @ noise),
+            drone.sensor.body_from_cam, drone.sensor.camera,
+            self._workshop.encode_keyframe(image, _MOST_BYTES, detail),
+        )  # fmt: skip
+        return answer if fix is None else replace(answer, world_from_body=fix.world_from_body)
+
+    def _image(self, i: int) -> Image:
+        drone = self._drones[i]
+        return load_image(drone.frames[self._index(drone)].path, drone.sensor.camera)
+
+    def _truth(self, i: int) -> Pose:
+        drone, at_ns = self._drones[i], self._frame_ns(i)
+        pose = None if drone.truth is None else drone.truth.pose_at(at_ns)
+        if pose is None:
+            raise RecordingError(
+                f"{drone.name}: no ground truth at {at_ns} ns: nothing to judge by"
+            )
+        return pose
+
+    def _frame_ns(self, i: int) -> int:
+        return self._drones[i].frames[self._index(self._drones[i])].at_ns
+
+    def _index(self, drone: Drone) -> int:
+        """Return which of a drone's frames was taken at about the leader's instant."""
+        at_ns = np.array([frame.at_ns for frame in drone.frames])
+        return int(np.argmin(np.abs(at_ns - self._instants[self._at])))
+
+    def _apart_m(self, a: int, b: int) -> float:
+        return float(np.linalg.norm(self._truth(a).translation - self._truth(b).translation))

@@ -1,0 +1,80 @@
+"""``python -m sitl consistency``: one recording after the other, from many instants of each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sitl.consistency.chain import Chain
+from sitl.consistency.report import Beginning, recording_report, write_consistency
+from vcl_companion.errors import ConfigError, RecordingError
+from vcl_companion.recording import Recording, read_recording
+from vcl_companion.vision.warm_up import warm_up
+
+Told = Callable[[str], None]
+
+# Of a flight every second frame is looked at; photographs metres apart are few.
+_STEP, _FEW = 2, 20
+# What begins later than this has hardly anything to be extended by.
+_LATEST_SHARE = 0.8
+
+
+@dataclass(frozen=True)
+class ConsistencyOptions:
+    """How many maps are made.
+
+    Attributes:
+        starts: instants of each recording that maps begin at, at most.
+        extensions: of each of these, at most.
+        seed: of the errors of attitudes and predictions.
+    """
+
+    starts: int = 8
+    extensions: int = 5
+    seed: int = 0
+
+
+def consistency(
+    recordings: Sequence[Path], out: Path, options: ConsistencyOptions, told: Told
+) -> dict[str, Any]:
+    """Make the maps, judge the poses on them, and write what came of it into a folder.
+
+    Raises:
+        RecordingError: a recording cannot be used.
+        ConfigError: the folder cannot be written.
+    """
+    read = [read_recording(path) for path in recordings]
+    names = [recording.name for recording in read]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"two recordings of one name: {', '.join(sorted(names))}")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be written ({error.strerror})") from error
+    warm_up()
+    found = {}
+    for recording in read:
+        found[recording.name] = recording_report(_beginnings(recording, options, told))
+    try:
+        return write_consistency(out, found)
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be written ({error.strerror})") from error
+
+
+def _beginnings(recording: Recording, options: ConsistencyOptions, told: Told) -> list[Beginning]:
+    n = len(recording.drone(recording.leader).frames)
+    if n < 2:
+        raise RecordingError(f"{recording.path}: one frame of the leader's: nothing to look for")
+    step = 1 if n <= _FEW else _STEP
+    latest = max(int(_LATEST_SHARE * n) - step, 0)
+    out = []
+    for begins in np.unique(np.linspace(0, latest, options.starts).astype(int)).tolist():
+        told(f"{recording.name}: maps from frame {begins} on")
+        chain = Chain(recording, begins, options.seed)
+        looks = tuple(chain.looks(step, options.extensions))
+        out.append(Beginning(begins, looks, chain.ended))
+    return out

@@ -1,0 +1,144 @@
+"""What many maps' poses come to: ``consistency.json``, ``consistency.md``, the terminal's table."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from sitl.bench.machine import machine
+from sitl.consistency.chain import Look
+from sitl.default_goals import NEES_MEDIAN
+from sitl.report import rounded
+
+# 99.9 % of chi^2 with 6 degrees of freedom.
+_FAR = 22.5
+_OF_EACH = "of each"
+_COLUMNS = ("recording", "begun", "poses", "lost", "NEES", "first map", "later", _OF_EACH,
+            "> 22.5 %", "in 3 sigma %", "error cm")  # fmt: skip
+_HOW = (
+    "Maps begun at many instants of each recording and extended from there; poses by their "
+    "patches alone, against the truth. *NEES*: median of the normalized squared error of all "
+    "poses, 6 degrees of freedom, 5.35 of a normal error; on first maps, on later ones, and of "
+    "each beginning, which is one draw of its map's error. *Lost*: frames that patches did not "
+    "find. *Error*: median of the position's."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Beginning:
+    """The poses of one chain of maps.
+
+    Attributes:
+        begins: index of the leader's frame that it began with.
+        looks: all frames looked for.
+        ended: why it ended, where the recording had not.
+    """
+
+    begins: int
+    looks: tuple[Look, ...]
+    ended: str
+
+
+def nees_of(look: Look) -> float:
+    """Return a pose's normalized squared error; NaN where there is none."""
+    if look.fix is None:
+        return float("nan")
+    error = look.fix.world_from_body.local(look.true)
+    return float(error @ np.linalg.solve(look.fix.covariance(), error))
+
+
+def recording_report(beginnings: Sequence[Beginning]) -> dict[str, Any]:
+    """Return what one recording's poses come to; numbers that there are not are null."""
+    looks = [look for beginning in beginnings for look in beginning.looks]
+    found = [look for look in looks if look.fix is not None]
+    nees = np.array([nees_of(look) for look in found])
+    is_first = np.array([look.revision == 0 for look in found], dtype=bool)
+    errors = [_position(look) for look in found]
+    report = {
+        "begun": len(beginnings),
+        "poses": len(found),
+        "lost": len(looks) - len(found),
+        "nees_median": _median(nees),
+        "nees_median_first_map": _median(nees[is_first]),
+        "nees_median_later": _median(nees[~is_first]),
+        "nees_median_of_each": {
+            str(one.begins): _median(np.array([nees_of(k) for k in one.looks if k.fix is not None]))
+            for one in beginnings
+        },
+        "far_share": float(np.mean(nees > _FAR)) if found else None,
+        "within_3_sigma_share": float(np.mean([e[1] for e in errors])) if found else None,
+        "position_error_m_median": _median(np.array([e[0] for e in errors])),
+        "ended": {str(one.begins): one.ended for one in beginnings if one.ended},
+    }
+    checked = rounded(report)
+    assert isinstance(checked, dict)
+    return checked
+
+
+def _position(look: Look) -> tuple[float, bool]:
+    """Return how far a position is off, m, and whether within 3 sigma along each axis."""
+    assert look.fix is not None
+    error = look.fix.world_from_body.local(look.true)[:3]
+    limit = 3.0 * np.sqrt(np.diag(look.fix.covariance())[:3])
+    return float(np.linalg.norm(error)), bool(np.all(np.abs(error) <= limit))
+
+
+def _median(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
+    return float(np.median(values)) if len(values) else None
+
+
+def write_consistency(out: Path, recordings: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Write ``consistency.json`` and ``consistency.md``; return the former's content."""
+    report = {"machine": machine(), "nees_wanted": list(NEES_MEDIAN), "recordings": recordings}
+    text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
+    (out / "consistency.json").write_text(text + "\n", encoding="utf-8")
+    lines = ["# Errors as they are told", "", _HOW, "", "| " + " | ".join(_COLUMNS) + " |"]
+    lines += ["|---|" + "---:|" * (len(_COLUMNS) - 1)]
+    lines += ["| " + " | ".join(row) + " |" for row in _rows(recordings)]
+    (out / "consistency.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return report
+
+
+def show_consistency(console: Console, report: dict[str, Any], out: Path) -> None:
+    """Print the table, and where it is."""
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+    # A line of a terminal has no room for each beginning.
+    shown = [n for n, head in enumerate(_COLUMNS) if head != _OF_EACH]
+    for n in shown:
+        table.add_column(_COLUMNS[n], justify="left" if n == 0 else "right")
+    for row in _rows(report["recordings"]):
+        table.add_row(*(row[n] for n in shown))
+    console.print(table)
+    path = out / "consistency.md"
+    console.print(f"report: {path}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _rows(recordings: dict[str, dict[str, Any]]) -> list[tuple[str, ...]]:
+    return [
+        (
+            name,
+            str(of["begun"]),
+            str(of["poses"]),
+            str(of["lost"]),
+            *(_number(of[key]) for key in (
+                "nees_median", "nees_median_first_map", "nees_median_later"
+            )),
+            " ".join(map(_number, of["nees_median_of_each"].values())),
+            _number(of["far_share"], 100.0),
+            _number(of["within_3_sigma_share"], 100.0),
+            _number(of["position_error_m_median"], 100.0),
+        )
+        for name, of in recordings.items()
+    ]  # fmt: skip
+
+
+def _number(value: float | None, factor: float = 1.0) -> str:
+    return "" if value is None else f"{factor * value:.1f}"
