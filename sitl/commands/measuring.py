@@ -11,6 +11,12 @@ import click
 from sitl.commands.options import FOLDER, PIPELINES, speed, start_timeout_option
 
 
+def _one_thread() -> None:
+    """Let numpy have one thread, as all that it is compared with; this counts before its import."""
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+
+
 @click.command()
 @click.option("--out", required=True, metavar="DIR", type=FOLDER, help="Results; made if absent.")
 @click.option(
@@ -139,9 +145,7 @@ def bench(
     costs grow with the map and the image, in minutes.
     realtime: three daemons at 30 Hz: dropped frames, latency, memory, load, in minutes.
     """
-    # One thread for everybody: this counts before numpy is loaded.
-    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    _one_thread()
     from rich.console import Console
 
     from sitl.bench.command import BenchOptions, run_bench
@@ -183,9 +187,7 @@ def torture(
     but a WireError may be raised, and memory may not grow. Exit status: 0, 1 when
     something failed, 2 for input that cannot be used.
     """
-    # One thread for everybody: this counts before numpy is loaded.
-    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    _one_thread()
     from rich.console import Console
 
     from sitl.torture.command import run_torture
@@ -220,9 +222,7 @@ def scale(drones: str, loss: float, seed: int, out: Path) -> None:
     a first map and its update are handed out. Minutes for 100. Leaves scale.md, scale.json and
     scale.svg in the output folder. Exit status: 0, 2 for input that cannot be used.
     """
-    # One thread for everybody: this counts before numpy is loaded.
-    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    _one_thread()
     from rich.console import Console
 
     from sitl.scale.command import ScaleOptions, parse_drones, run_scale
@@ -262,9 +262,7 @@ def consistency(
     fast as can be: a minute for ten maps. Leaves consistency.md and consistency.json in the
     output folder. Exit status: 0, whatever was measured; 2 for input that cannot be used.
     """
-    # One thread for everybody: this counts before numpy is loaded.
-    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    _one_thread()
     from rich.console import Console
 
     from sitl.consistency.command import ConsistencyOptions

@@ -10,7 +10,6 @@ import numpy as np
 from sitl.daemon_config import TRUE_DISTANCE_SIGMA_M
 from vcl_companion.daemon.map_offer import MapOffer, ReadyMap
 from vcl_companion.daemon.workshop import WorkOptions, Workshop
-from vcl_companion.errors import RecordingError
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import exp_so3, quaternion_from_matrix
 from vcl_companion.localization.detail import Detail, needed_detail
@@ -32,8 +31,10 @@ _UPDATES = UpdateOptions()
 _ATTITUDE_DEG = 0.3
 # A prediction as a filter's between frames, 1 sigma; it is told as twice that.
 _PREDICTED = np.array([0.02] * 3 + [0.002] * 3)
-# Drones want an update where it would become so; one that takes no time comes then.
-_NOVELTY_DEG = 1.6 * _UPDATES.novelty_deg
+# What drones foresee before they want an update (``swarm.updates``): here it is there at once.
+_NOVELTY_DEG = 8.0
+# Frames of drones that lie no further apart than this share of a period are of one instant.
+_AT_ONCE = 0.5
 _MOST_BYTES = 1 << 20
 
 
@@ -58,13 +59,10 @@ class Chain:
     """The maps of a flight that begins at one of a recording's instants.
 
     Args:
-        recording: each drone with its truth.
+        recording: each drone with its truth; where one has no frame, or no truth, it is left out.
         begins: index of the leader's frame that it begins with.
         seed: of the attitudes' and the predictions' errors.
         novelty_deg: how newly a map looks before it is extended.
-
-    Raises:
-        RecordingError: a drone has no truth there, or there is no known distance.
     """
 
     def __init__(
@@ -73,14 +71,14 @@ class Chain:
         self._drones = recording.drones
         self._leader = [drone.name for drone in recording.drones].index(recording.leader)
         self._instants = [frame.at_ns for frame in recording.drone(recording.leader).frames]
+        self._apart_ns = _AT_ONCE * 1e9 / recording.frame_rate_hz
         self._at = begins
         self._rng = np.random.default_rng([seed, begins])
-        ids = {drone.name: i + 1 for i, drone in enumerate(recording.drones)}
-        if not recording.known_distances:
-            raise RecordingError(f"{recording.path}: no known_distance: maps would have no scale")
+        index = {drone.name: i for i, drone in enumerate(recording.drones)}
+        pairs = [(index[pair.a], index[pair.b]) for pair in recording.known_distances]
+        there = self._there()
         apart = tuple(
-            (ids[pair.a], ids[pair.b], self._apart_m(ids[pair.a] - 1, ids[pair.b] - 1))
-            for pair in recording.known_distances
+            (a + 1, b + 1, self._apart_m(a, b)) for a, b in pairs if a in there and b in there
         )
         options = WorkOptions(
             apart, _MAPPING, _PIPELINE, _MAPPING.detectors, InterMavOptions(), tracked=True
@@ -104,17 +102,19 @@ class Chain:
             return
         while self._at + step < len(self._instants):
             self._at += step
-            looks = [self._look(i) for i in range(len(self._drones))]
+            looks = [self._look(i) for i in self._there()]
             yield from looks
-            if 2 * sum(map(self._is_wanted, looks)) <= len(looks):
+            if not looks or 2 * sum(map(self._is_wanted, looks)) <= len(looks):
                 continue
             if self._n_extensions == n_extensions or not self._extended(looks):
                 return
 
     def _begun(self) -> bool:
-        made = self._workshop.first_map(
-            [self._answer(i, None) for i in range(len(self._drones))], self._leader + 1
-        )
+        there = self._there()
+        if self._leader not in there:
+            self.ended = "there is no truth of the leader's"
+            return False
+        made = self._workshop.first_map([self._answer(i, None) for i in there], self._leader + 1)
         if isinstance(made, NoMap):
             self.ended = made.reason
             return False
@@ -158,12 +158,15 @@ class Chain:
         )
         fix = track(
             self._image(i), drone.sensor.camera, drone.sensor.body_from_cam, templates, prior,
-            None, _PIPELINE.tracking, _PIPELINE.localization,
+            None, _PIPELINE.tracking, _PIPELINE.localization, i + 1,
         )  # fmt: skip
         return Look(i, self._n_extensions, true, fix if isinstance(fix, Localized) else None)
 
     def _is_wanted(self, look: Look) -> bool:
-        """Whether a drone wants the map extended (``swarm.updates``, without foresight)."""
+        """Whether a drone wants the map extended: it sees too little, or anew what it sees.
+
+        Of the reasons of ``swarm.updates`` coverage and vagueness do not count here.
+        """
         fix, i = look.fix, look.drone
         if fix is None:
             return True
@@ -195,19 +198,27 @@ class Chain:
         return load_image(drone.frames[self._index(drone)].path, drone.sensor.camera)
 
     def _truth(self, i: int) -> Pose:
-        drone, at_ns = self._drones[i], self._frame_ns(i)
-        pose = None if drone.truth is None else drone.truth.pose_at(at_ns)
+        truth = self._drones[i].truth
+        pose = None if truth is None else truth.pose_at(self._frame_ns(i))
         if pose is None:
-            raise RecordingError(
-                f"{drone.name}: no ground truth at {at_ns} ns: nothing to judge by"
-            )
+            raise ValueError(f"there is no truth of {self._drones[i].name}")
         return pose
+
+    def _there(self) -> list[int]:
+        """Return the drones that have a frame of this instant, and its truth."""
+        return [
+            i
+            for i, drone in enumerate(self._drones)
+            if abs(self._frame_ns(i) - self._instants[self._at]) <= self._apart_ns
+            and drone.truth is not None
+            and drone.truth.pose_at(self._frame_ns(i)) is not None
+        ]
 
     def _frame_ns(self, i: int) -> int:
         return self._drones[i].frames[self._index(self._drones[i])].at_ns
 
     def _index(self, drone: Drone) -> int:
-        """Return which of a drone's frames was taken at about the leader's instant."""
+        """Return which of a drone's frames is the nearest to the leader's instant."""
         at_ns = np.array([frame.at_ns for frame in drone.frames])
         return int(np.argmin(np.abs(at_ns - self._instants[self._at])))
 

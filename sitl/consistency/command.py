@@ -47,28 +47,45 @@ def consistency(
         RecordingError: a recording cannot be used.
         ConfigError: the folder cannot be written.
     """
-    read = [read_recording(path) for path in recordings]
+    read = [_usable(path) for path in recordings]
     names = [recording.name for recording in read]
     if len(set(names)) < len(names):
         raise ConfigError(f"two recordings of one name: {', '.join(sorted(names))}")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be written ({error.strerror})") from error
+    report = _written(out, {})
     warm_up()
     found = {}
     for recording in read:
         found[recording.name] = recording_report(_beginnings(recording, options, told))
+        report = _written(out, found)
+    return report
+
+
+def _written(out: Path, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
     try:
+        out.mkdir(parents=True, exist_ok=True)
         return write_consistency(out, found)
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written ({error.strerror})") from error
 
 
+def _usable(path: Path) -> Recording:
+    """Read a recording; refuse one that poses cannot be judged in."""
+    recording = read_recording(path)
+    if not recording.known_distances:
+        raise RecordingError(
+            f"{path}: no known distance, so that maps have no scale; say "
+            'known_distance = ["mav0", "mav1"] in its recording.toml'
+        )
+    if len(recording.drone(recording.leader).frames) < 2:
+        raise RecordingError(f"{path}: one frame of the leader's: nothing to look for on its map")
+    for drone in recording.drones:
+        if drone.truth is None:
+            raise RecordingError(f"{path}: {drone.name} has no ground truth to be judged by")
+    return recording
+
+
 def _beginnings(recording: Recording, options: ConsistencyOptions, told: Told) -> list[Beginning]:
     n = len(recording.drone(recording.leader).frames)
-    if n < 2:
-        raise RecordingError(f"{recording.path}: one frame of the leader's: nothing to look for")
     step = 1 if n <= _FEW else _STEP
     latest = max(int(_LATEST_SHARE * n) - step, 0)
     out = []

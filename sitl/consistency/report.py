@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from sitl.bench.machine import machine
@@ -21,7 +22,7 @@ from sitl.report import rounded
 # 99.9 % of chi^2 with 6 degrees of freedom.
 _FAR = 22.5
 _OF_EACH = "of each"
-_COLUMNS = ("recording", "begun", "poses", "lost", "NEES", "first map", "later", _OF_EACH,
+_COLUMNS = ("recording", "instants", "poses", "lost", "NEES", "first map", "later", _OF_EACH,
             "> 22.5 %", "in 3 sigma %", "error cm")  # fmt: skip
 _HOW = (
     "Maps begun at many instants of each recording and extended from there; poses by their "
@@ -39,7 +40,7 @@ class Beginning:
     Attributes:
         begins: index of the leader's frame that it began with.
         looks: all frames looked for.
-        ended: why it ended, where the recording had not.
+        ended: why it could not be begun, or not be extended; empty otherwise.
     """
 
     begins: int
@@ -63,7 +64,7 @@ def recording_report(beginnings: Sequence[Beginning]) -> dict[str, Any]:
     is_first = np.array([look.revision == 0 for look in found], dtype=bool)
     errors = [_position(look) for look in found]
     report = {
-        "begun": len(beginnings),
+        "instants": len(beginnings),
         "poses": len(found),
         "lost": len(looks) - len(found),
         "nees_median": _median(nees),
@@ -102,7 +103,9 @@ def write_consistency(out: Path, recordings: dict[str, dict[str, Any]]) -> dict[
     (out / "consistency.json").write_text(text + "\n", encoding="utf-8")
     lines = ["# Errors as they are told", "", _HOW, "", "| " + " | ".join(_COLUMNS) + " |"]
     lines += ["|---|" + "---:|" * (len(_COLUMNS) - 1)]
-    lines += ["| " + " | ".join(row) + " |" for row in _rows(recordings)]
+    rows = [[cell.replace("|", "\\|") for cell in row] for row in _rows(recordings)]
+    lines += ["| " + " | ".join(row) + " |" for row in rows]
+    lines += ["", *(f"* {text}" for text in _ends(recordings))]
     (out / "consistency.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return report
 
@@ -113,10 +116,12 @@ def show_consistency(console: Console, report: dict[str, Any], out: Path) -> Non
     # A line of a terminal has no room for each beginning.
     shown = [n for n, head in enumerate(_COLUMNS) if head != _OF_EACH]
     for n in shown:
-        table.add_column(_COLUMNS[n], justify="left" if n == 0 else "right")
+        table.add_column(_COLUMNS[n], justify="left" if n == 0 else "right", overflow="fold")
     for row in _rows(report["recordings"]):
-        table.add_row(*(row[n] for n in shown))
+        table.add_row(*(escape(row[n]) for n in shown))
     console.print(table)
+    for text in _ends(report["recordings"]):
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
     path = out / "consistency.md"
     console.print(f"report: {path}", markup=False, highlight=False, soft_wrap=True)
 
@@ -125,7 +130,7 @@ def _rows(recordings: dict[str, dict[str, Any]]) -> list[tuple[str, ...]]:
     return [
         (
             name,
-            str(of["begun"]),
+            str(of["instants"]),
             str(of["poses"]),
             str(of["lost"]),
             *(_number(of[key]) for key in (
@@ -138,6 +143,15 @@ def _rows(recordings: dict[str, dict[str, Any]]) -> list[tuple[str, ...]]:
         )
         for name, of in recordings.items()
     ]  # fmt: skip
+
+
+def _ends(recordings: dict[str, dict[str, Any]]) -> list[str]:
+    """Return which maps could not be made, and why."""
+    return [
+        f"{name}, from frame {begins} on: {reason}"
+        for name, of in recordings.items()
+        for begins, reason in of["ended"].items()
+    ]
 
 
 def _number(value: float | None, factor: float = 1.0) -> str:

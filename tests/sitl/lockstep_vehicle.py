@@ -64,6 +64,8 @@ def main() -> None:
     assert folder == os.environ["PATH"].split(":")[0]
     assert os.environ["PX4_PARAM_EKF2_EV_CTRL"] == "11"
     assert os.environ["PX4_PARAM_EKF2_HGT_REF"] == "3"
+    # A step of its estimator for each reading of its sensors.
+    assert float(os.environ["PX4_PARAM_EKF2_PREDICT_US"]) == STEP_US
     simulator_port = number_in(
         "px4-rc.mavlinksim", r"simulator_mavlink start -t 127\.0\.0\.1 (\d+)"
     )

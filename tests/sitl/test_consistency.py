@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from sitl.consistency.report import Beginning, nees_of, recording_report
 from tests.daemon.demo import DEMO
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.localization.intra import Localized
-from vcl_companion.recording import read_recording
+from vcl_companion.recording import Trajectory, read_recording
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def test_poses_of_many_maps_err_as_much_as_they_say(
     report, out, told = measured
     assert report == json.loads((out / "consistency.json").read_text(encoding="utf-8"))
     (of,) = report["recordings"].values()
-    assert of["begun"] == len(told) == len(of["nees_median_of_each"]) == 2
+    assert of["instants"] == len(told) == len(of["nees_median_of_each"]) == 2
     assert of["poses"] > 30
     assert of["lost"] <= of["poses"] // 5
     # A few draws of maps' errors: anything but several times too sure, or too careful.
@@ -50,7 +51,7 @@ def test_poses_of_many_maps_err_as_much_as_they_say(
 
 def test_a_chain_of_maps_is_the_same_every_time() -> None:
     recording = read_recording(DEMO)
-    looks = [list(Chain(recording, 20, seed=3).looks(8, 0))[:3] for _ in range(2)]
+    looks = [list(islice(Chain(recording, 20, seed=3).looks(8, 0), 3)) for _ in range(2)]
     assert [look.drone for look in looks[0]] == [0, 1, 2]
     for one, other in zip(*looks, strict=True):
         assert one.fix is not None
@@ -126,4 +127,28 @@ def test_what_cannot_be_used_is_said_in_a_line(tmp_path: Path) -> None:
     shutil.rmtree(untold / "mav1" / "state_groundtruth_estimate0")
     status, text = run(untold, "--out", tmp_path / "out")
     assert status == 2
-    assert "mav1: no ground truth" in text
+    assert "mav1 has no ground truth" in text
+    shutil.copytree(DEMO / "mav1", untold / "mav1", dirs_exist_ok=True)
+    (untold / "recording.toml").write_text("frame_rate_hz = 5.0\n", encoding="utf-8")
+    status, text = run(untold, "--out", tmp_path / "out")
+    assert status == 2
+    assert "known_distance" in text
+
+
+def test_a_drone_is_left_out_where_it_has_no_frame_or_no_truth() -> None:
+    whole = read_recording(DEMO)
+    one, two, three = whole.drones
+    assert three.truth is not None
+    n = 121  # six seconds of twelve
+    ends = Trajectory(
+        three.truth.at_ns[:n], three.truth.positions_m[:n], three.truth.quaternions[:n]
+    )
+    few = replace(two, frames=two.frames[:30])
+    recording = replace(whole, drones=(one, few, replace(three, truth=ends)))
+    seen = [look.drone for look in Chain(recording, 26, seed=3).looks(2, 0)]
+    assert seen[:5] == [0, 1, 2, 0, 2]
+    assert set(seen[5:]) == {0}
+    blind = replace(whole, drones=(replace(one, truth=ends), two, three))
+    chain = Chain(blind, 50, seed=3)
+    assert list(chain.looks(2, 0)) == []
+    assert "no truth of the leader's" in chain.ended

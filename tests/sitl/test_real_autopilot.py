@@ -177,7 +177,7 @@ def test_px4_is_neither_ahead_nor_behind_whichever_of_its_steps_our_poses_fall_i
 
     booted_before_ns = PX4.booted_before_ns + steps * STEP_NS
     flown(replace(PX4, booted_before_ns=booted_before_ns), tmp_path, scenario)
-    # A step is 4 ms: less than half of one, of which the one second's noise may be half.
+    # A step is 4 ms: of that hardly anything, and in no second, whose motion tells less, all of it.
     assert abs(np.mean(behind_s)) < 0.001, behind_s
     assert np.abs(behind_s).max() < 0.003, behind_s
 

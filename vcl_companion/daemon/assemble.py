@@ -155,7 +155,9 @@ async def _run(config: Config) -> int:
     forget_peak()
     # The paper's pipeline would leave nothing to others: a frame takes longer than it may.
     realtime = tracked and config.scheduling == "realtime"
-    pipeline = PipelineOptions(config.features, config.localization, config.tracking)
+    pipeline = PipelineOptions(
+        config.features, config.localization, config.tracking, config.system_id
+    )
     building = replace(config.map, patches=config.map.patches and tracked)
     # Frames never wait for a map that is being built, nor for one that is looked for all over
     # it: that is another process, begun while no threads are at work that it would not have.

@@ -42,11 +42,16 @@ _LED_BY_A_VAGUE_POSE = 0.5
 
 @dataclass(frozen=True)
 class PipelineOptions:
-    """What the steps of a frame are tuned by; see each of them."""
+    """What the steps of a frame are tuned by; see each of them.
+
+    Attributes:
+        drone_id: system id of whose frames they are: its keyframes were seen by the same lens.
+    """
 
     features: FeatureOptions
     localization: LocalizationOptions
     tracking: TrackingOptions
+    drone_id: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +116,7 @@ def localize(
     if templates is not None and prior is not None and effort.may_track:
         tracked = _unless_by_chance(track(
             image, camera, body_from_cam, templates, prior, ned_from_body,
-            options.tracking, options.localization,
+            options.tracking, options.localization, options.drone_id,
         ))  # fmt: skip
         if isinstance(tracked, Localized):
             if not (effort.may_doubt and is_doubtful(tracked)):
@@ -177,7 +182,7 @@ def _recognised(
         return found
     closer = track(
         image, camera, body_from_cam, templates, leads, ned_from_body,
-        options.tracking, options.localization,
+        options.tracking, options.localization, options.drone_id,
     )  # fmt: skip
     if _is_by_chance(closer):
         return _unless_by_chance(closer)

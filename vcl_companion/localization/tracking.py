@@ -41,7 +41,8 @@ _SINGULAR = 1e-9
 _MAX_ROUNDS = 3
 # Patches warped and begun so near to where they are need no second look.
 _WELL_PREDICTED_PX = 0.5
-# Patches that lie so far from where they are in their keyframes are shifted as much as any.
+# Patches that lie so far from where they are in their keyframes are shifted as much as any;
+# half as far, half as much.
 _SHIFTED_WHOLLY_PX = 40.0
 
 
@@ -62,8 +63,9 @@ class TrackingOptions:
         misplaced_by_residual: per sigma that the residual of the grey levels explains.
         shifted_px: what all alignments of an image are off together, in each direction: no lens
             is known better, nor what a patch's surface, its light and an encoder do to it. However
-            many landmarks there are, this does not average out. Of patches that are found nearly
-            where they are in their keyframes all that is alike: there it is less.
+            many landmarks there are, this does not average out. Where most patches lie nearly
+            where the same drone's camera saw them in its keyframes, all that is alike, and it is
+            less.
     """
 
     n_landmarks: int = 400
@@ -120,6 +122,7 @@ def track(
     ned_from_body: Array | None,
     options: TrackingOptions,
     belief: LocalizationOptions,
+    drone_id: int | None = None,
 ) -> Localized | NotLocalized:
     """Find the drone's pose by the map's patches near where the prediction puts them.
 
@@ -135,11 +138,12 @@ def track(
         ned_from_body: (3, 3) attitude by the autopilot at that instant, or None.
         options: how it is tracked.
         belief: when a pose is believed, whatever it rests on.
+        drone_id: whose camera it is, to be known among those of the keyframes; None: nobody's.
 
     Returns:
         The pose with its covariance in parts, or why there is none.
     """
-    tracker = _Tracker(image, camera, body_from_cam, templates, options, belief)
+    tracker = _Tracker(image, camera, body_from_cam, templates, options, belief, drone_id)
     return tracker.located(prior, ned_from_body)
 
 
@@ -154,6 +158,7 @@ class _Tracker:
         templates: Templates,
         options: TrackingOptions,
         belief: LocalizationOptions,
+        drone_id: int | None,
     ) -> None:
         self._frame = pyramid_of(image)
         self._camera = camera
@@ -163,6 +168,7 @@ class _Tracker:
         self._anchors: Anchors = templates.anchors
         self._options = options
         self._belief = belief
+        self._drone_id = drone_id
         size_px = (camera.width_px, camera.height_px)
         self._poses = PatchPoses(body_from_cam, size_px, belief.min_inliers)
 
@@ -312,6 +318,9 @@ class _Tracker:
     def _by_shift(self, found: Alignment) -> Array:
         """Return the pose's (6, 6) covariance by a shift of the whole image: the camera, turned."""
         moved_px = np.linalg.norm(found.pixels - self._anchors.pixels[found.anchors], axis=1)
+        # Another drone's lens is another one.
+        took = self._templates.drone_ids[self._anchors.keyframe[found.anchors]]
+        moved_px[took != (-1 if self._drone_id is None else self._drone_id)] = np.inf
         share = min(float(np.median(moved_px)) / _SHIFTED_WHOLLY_PX, 1.0)
         turned = adjoint(self._mounting)[:, 3:5]
         shifted_rad = share * self._options.shifted_px / self._camera.focal_px

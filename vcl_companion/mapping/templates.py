@@ -34,10 +34,12 @@ class Templates:
     Attributes:
         anchors: landmarks in keyframes.
         uncertainty: the map's joint covariance, as the features' pipeline has it.
+        drone_ids: (V,) system ids of those who took the keyframes.
     """
 
     anchors: Anchors
     uncertainty: MapUncertainty
+    drone_ids: NDArray[np.int64]
 
 
 def prepare_templates(
@@ -92,7 +94,8 @@ def prepare_templates(
         texture=texture,
         images=keyframe_images(pyramids, poses),
     )
-    return Templates(anchors, uncertainty)
+    drone_ids = np.array([k.drone_id for k in landmark_map.keyframes], dtype=np.int64)
+    return Templates(anchors, uncertainty, drone_ids)
 
 
 @dataclass(frozen=True, eq=False)
