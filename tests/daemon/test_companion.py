@@ -565,7 +565,7 @@ def test_an_autopilot_that_turns_its_north_is_followed_after_a_few_frames(tmp_pa
         async with flying(tmp_path) as up:
             up.fly_on_a_map()
             for k in range(8):
-                up.give(k, north_turned_rad=0.0 if k < 2 else np.deg2rad(12.0))
+                up.give(k, north_turned_rad=0.0 if k < 2 else np.deg2rad(22.0))
                 await up.server.answered()
             outcomes = [outcome for _, outcome, _ in up.frames()]
             assert outcomes == ["localized"] * 2 + ["refused"] * 4 + ["localized"] * 2
@@ -574,6 +574,23 @@ def test_an_autopilot_that_turns_its_north_is_followed_after_a_few_frames(tmp_pa
             assert [after - resets[0] for after in resets] == [0, 0, 1, 1]
             # Frames that contradict the state: it is not sent on its own word.
             assert up.bases() == ["patches"] * 2 + [None] * 4 + ["patches"] * 2
+
+    run(scenario())
+
+
+def test_an_autopilot_whose_attitude_errs_for_a_moment_costs_no_frame(tmp_path: Path) -> None:
+    """Nearly all patches of the map agree on where it is: the autopilot errs, and then does not."""
+
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            for k in range(8):
+                up.give(k, north_turned_rad=np.deg2rad(12.0) if 2 <= k < 5 else 0.0)
+                await up.server.answered()
+            assert [outcome for _, outcome, _ in up.frames()] == ["localized"] * 8
+            assert up.bases() == ["patches"] * 8
+            resets = [(await up.autopilot.poses.get())[-1] for _ in range(8)]
+            assert len(set(resets)) == 1
 
     run(scenario())
 

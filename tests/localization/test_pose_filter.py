@@ -14,7 +14,7 @@ from tests.checks import assert_consistent, assert_pose_close, numeric_jacobian
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, matrix_from_euler
 from vcl_companion.geometry.similarity import Similarity
-from vcl_companion.localization.intra import Localized, NotLocalized
+from vcl_companion.localization.intra import Localized, NotLocalized, Recognised
 from vcl_companion.localization.pose_filter import (
     FilterOptions,
     FilterState,
@@ -364,6 +364,40 @@ def test_an_autopilot_that_errs_by_a_few_degrees_is_not_believed_and_no_jump() -
     # The same turn somewhere else is another place that looks alike.
     elsewhere = update(predicted, fix_at(Pose(turned, expected + np.array([0.0, 4.0, 0.0]))))
     assert isinstance(elsewhere, NotLocalized)
+
+
+@pytest.mark.parametrize(
+    ("by", "n_matched", "n_inliers", "turned_deg", "is_taken"),
+    [
+        ("patches", 400, 390, 12.0, True),
+        ("patches", 400, 390, 25.0, False),
+        ("patches", 400, 300, 12.0, False),
+        ("patches", 200, 190, 12.0, False),
+        ("features", 400, 390, 12.0, False),
+    ],
+)
+def test_what_nearly_all_patches_agree_on_is_believed_against_the_attitude(
+    by: Recognised, n_matched: int, n_inliers: int, turned_deg: float, is_taken: bool
+) -> None:
+    """Seen of ArduPilot: twelve degrees, where our first poses came late."""
+    state = settled(np.eye(3))
+    predicted = predict(state, 15 * STEP_NS, np.eye(3), FilterOptions())
+    assert predicted is not None
+    turned = exp_so3(np.deg2rad([0.0, 0.0, turned_deg]))
+    expected = predicted.world_from_body.translation
+
+    def seen_at(place: Array) -> Localized:
+        fix = fix_at(Pose(turned, place))
+        return replace(fix, n_matched=n_matched, n_inliers=n_inliers, by=by)
+
+    after = update(predicted, seen_at(expected))
+    assert isinstance(after, FilterState) == is_taken
+    if isinstance(after, FilterState):
+        assert after.n_jumps == state.n_jumps
+        assert np.linalg.norm(log_so3(turned.T @ after.world_from_body.rotation)) < np.deg2rad(0.1)
+    # The same somewhere else is another place that looks alike.
+    away = seen_at(expected + np.array([0.0, 4.0, 0.0]))
+    assert isinstance(update(predicted, away), NotLocalized)
 
 
 def test_a_turn_the_autopilot_saw_too_is_taken() -> None:

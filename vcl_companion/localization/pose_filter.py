@@ -28,8 +28,11 @@ _N_OWN = 12
 # 99.99 % of chi^2 with 6 and with 3 degrees of freedom: beyond, it is not noise.
 _GATE_POSE, _GATE_ROTATION, _GATE_POSITION = 27.9, 21.1, 21.1
 # An autopilot that takes its attitude from our poses in part, as it does while they begin, errs
-# by degrees that its noise does not tell of; by more it is never wrong without saying so.
-_MOST_TURNED_RAD = np.deg2rad(6.0)
+# by degrees that its noise does not tell of: by 3, and where our first poses come late by 12. More
+# than the former is believed of it only where what is seen leaves no doubt: so many patches of the
+# map, and so large a share of those tried, are where they should be at no wrong place.
+_MOST_TURNED_RAD, _MOST_TURNED_SEEN_RAD = np.deg2rad(6.0), np.deg2rad(20.0)
+_SEEN_PATCHES, _SEEN_SHARE = 200, 0.8
 # What is known after a jump, 1 sigma: nothing.
 _FORGOTTEN_M, _FORGOTTEN_M_S, _FORGOTTEN_RAD = 1e3, 10.0, np.pi
 _MAX_COAST_S = 60.0
@@ -271,8 +274,8 @@ def update(predicted: FilterState, fix: Localized) -> FilterState | NotLocalized
     prediction gone wrong) replaces position and speed and counts as a jump. One
     whose rotation contradicts the autopilot's turn since the last fix is wrong:
     repeated structure, a planar twin; but for a few degrees at the place where the drone was
-    expected, which are the autopilot's own. Where the autopilot sends no attitude, a
-    jump replaces the rotation as well.
+    expected, or more where nearly all of the map's patches agree: these are the
+    autopilot's own. Where it sends no attitude, a jump replaces the rotation as well.
     """
     predicted = _with_map(predicted, fix)
     innovation = predicted.world_from_body.local(fix.world_from_body)
@@ -283,7 +286,8 @@ def update(predicted: FilterState, fix: Localized) -> FilterState | NotLocalized
     if distance > _GATE_ROTATION and predicted.ned_from_body is not None:
         turned_rad = float(np.linalg.norm(innovation[3:]))
         away = innovation[:3] @ np.linalg.solve(expected[:3, :3], innovation[:3])
-        if turned_rad > _MOST_TURNED_RAD or away > _GATE_POSITION:
+        most_rad = _MOST_TURNED_SEEN_RAD if _leaves_no_doubt(fix) else _MOST_TURNED_RAD
+        if turned_rad > most_rad or away > _GATE_POSITION:
             return NotLocalized(
                 f"turned {np.rad2deg(turned_rad):.0f} degrees against the autopilot's attitude",
                 fix.n_matched,
@@ -459,6 +463,12 @@ def _with_map(state: FilterState, fix: Localized) -> FilterState:
     covariance[:_N_OWN, :_N_OWN] = state.covariance[:_N_OWN, :_N_OWN]
     covariance[_N_OWN:, _N_OWN:] = fix.keyframe_covariance
     return replace(state, covariance=covariance)
+
+
+def _leaves_no_doubt(fix: Localized) -> bool:
+    """Whether so many of the map's patches are where they should be that the pose is right."""
+    enough = fix.n_inliers >= max(_SEEN_PATCHES, _SEEN_SHARE * fix.n_matched)
+    return fix.by == "patches" and enough
 
 
 def _doubting_attitude(state: FilterState, turned_rad: float) -> FilterState:
