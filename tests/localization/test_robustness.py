@@ -166,7 +166,8 @@ def displaced(
     points = np.where(wrong[:, None], anchors.points_world + by_m, anchors.points_world)
     keyframe = anchors.keyframe + len(poses) * wrong
     moved = replace(anchors, images=twice, keyframe=keyframe, points_world=points)
-    return replace(templates, anchors=moved), wrong
+    taken_by = np.concatenate([templates.drone_ids, templates.drone_ids])
+    return replace(templates, anchors=moved, drone_ids=taken_by), wrong
 
 
 @pytest.mark.parametrize(
