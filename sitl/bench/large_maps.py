@@ -31,7 +31,7 @@ MANY_FEATURES = FeatureOptions(max_features=4000)
 
 _APART_M = 250.0
 _FAR_M = 1500.0
-_N_TIES = 60
+_N_TIES = 200
 _NOISE_PX = 0.2
 _SAME_DEPTH = 0.03
 _SAME_PX = 2.0
