@@ -157,7 +157,7 @@ def pose_errors(
         position_sigma_ref_m=_sigmas(in_ref),
         yaw_rad=np.array([row[3] for row in rows], dtype=float),
         yaw_sigma_rad=_sigmas(covariances)[:, 5],
-        nees=np.array([_nees(e, c) for e, c in zip(error_world, covariances, strict=True)]),
+        nees=np.array([nees_of(e, c) for e, c in zip(error_world, covariances, strict=True)]),
         within_3_sigma=np.all(np.abs(error_world[:, :3]) <= limit_m, axis=1),
         within_3_sigma_or_10cm=np.all(np.abs(error_world[:, :3]) <= floor_m, axis=1),
         truth_ref_m=truth_ref,
@@ -220,7 +220,7 @@ def rigid_alignment(moved: Array, fixed: Array) -> Pose:
     return Pose(rotation, centre_fixed - rotation @ centre_moved)
 
 
-def _nees(error: Array, covariance: Array) -> float:
+def nees_of(error: Array, covariance: Array) -> float:
     """Return e^T C^-1 e; NaN unless C is finite and positive definite."""
     if not np.all(np.isfinite(covariance)):
         return float("nan")

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sitl import evaluation
 from sitl.bench.machine import machine
 from sitl.consistency.chain import Look
 from sitl.default_goals import NEES_MEDIAN
@@ -52,8 +53,7 @@ def nees_of(look: Look) -> float:
     """Return a pose's normalized squared error; NaN where there is none."""
     if look.fix is None:
         return float("nan")
-    error = look.fix.world_from_body.local(look.true)
-    return float(error @ np.linalg.solve(look.fix.covariance(), error))
+    return evaluation.nees_of(look.fix.world_from_body.local(look.true), look.fix.covariance())
 
 
 def recording_report(beginnings: Sequence[Beginning]) -> dict[str, Any]:
