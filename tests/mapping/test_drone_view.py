@@ -14,6 +14,7 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.mapping.drone_view import DroneView, decode_image, encode_image
 from vcl_companion.vision.features import Features, Image
+from vcl_companion.vision.image_shift import shift_px
 
 CAMERA = Camera(160, 120, 100.0, 100.0, 79.5, 59.5)
 
@@ -47,6 +48,23 @@ def test_better_quality_is_more_bytes_and_less_error() -> None:
 def test_every_receiver_decodes_the_same_pixels() -> None:
     data = encode_image(texture(), 50)
     np.testing.assert_array_equal(decode_image(data, CAMERA), decode_image(data, CAMERA))
+
+
+@pytest.mark.parametrize("quality", [20, 36, 80])
+def test_what_is_decoded_lies_where_it_was(quality: int) -> None:
+    """The encoder alone would put it to the right and below."""
+    rng = np.random.default_rng(8)
+    drifts = []
+    for _ in range(4):
+        light = cv2.GaussianBlur(rng.normal(0.0, 1.0, (480, 640)), (0, 0), 2.0)
+        image = np.asarray(np.clip(128.0 + 200.0 * light, 0, 255), np.uint8)
+        plain = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])[1]
+        both = (np.asarray(plain), np.frombuffer(encode_image(image, quality), np.uint8))
+        decoded = [np.asarray(cv2.imdecode(b, cv2.IMREAD_GRAYSCALE), np.uint8) for b in both]
+        drifts.append([shift_px(image, one) for one in decoded])
+    plain_px, ours_px = np.mean(drifts, axis=0)
+    assert (plain_px > 0.002).all(), plain_px
+    assert np.linalg.norm(ours_px) < 0.4 * np.linalg.norm(plain_px), (plain_px, ours_px)
 
 
 def test_an_image_without_pixels_cannot_be_encoded() -> None:

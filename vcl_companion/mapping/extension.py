@@ -24,13 +24,20 @@ from vcl_companion.mapping.known_features import Index
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.new_landmarks import Shown, free_of, new_landmarks, shown, with_room
 from vcl_companion.mapping.options import MapOptions
-from vcl_companion.mapping.patch_table import PatchTable, PyramidOf, Reference, pyramids_of
+from vcl_companion.mapping.patch_table import (
+    PatchTable,
+    PyramidOf,
+    Reference,
+    landmark_noise,
+    pyramids_of,
+)
 from vcl_companion.mapping.placing import Placed, place, references
 from vcl_companion.mapping.sharpening import SETTLED_CAUCHY_PX
 from vcl_companion.mapping.thinning import spread
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.mapping.uncertainty import MapUncertainty, views_of
-from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust
+from vcl_companion.mapping.weighing import adjust_weighed
+from vcl_companion.vision.bundle import BundleOptions, Distance, Views
 from vcl_companion.vision.features import Detector, Features
 from vcl_companion.vision.patches import AlignRules
 from vcl_companion.vision.resection import NotFound
@@ -60,12 +67,15 @@ class Table:
         points: (N, 3) m, NaN where not placed.
         source: (N,) view that a new landmark's patch is cut from, -1 for old ones.
         bodies: V poses.
+        noise: (N, 3) xx xy yy of each landmark's pixels (``landmark_noise``); NaN where it
+            has not been looked for from poses that are adjusted already.
     """
 
     observed: Array
     points: Array
     source: Index
     bodies: tuple[Pose, ...]
+    noise: Array
 
 
 class Extension:
@@ -142,7 +152,8 @@ class Extension:
             bodies.append(at.world_from_body if at else view.world_from_body or Pose.identity())
             if at:
                 observed[at.landmarks, self._n_keys + i] = at.pixels
-        return Table(observed, self._old.points_world, np.full(n, -1, np.intp), tuple(bodies))
+        source, noise = np.full(n, -1, np.intp), np.full((n, 3), np.nan)
+        return Table(observed, self._old.points_world, source, tuple(bodies), noise)
 
     def _with_new(self, table: Table, joined: list[int]) -> Table:
         """Add landmarks that new views show and the map has not."""
@@ -178,6 +189,7 @@ class Extension:
                 observed=np.concatenate([table.observed, observed]),
                 points=np.concatenate([table.points, points]),
                 source=np.concatenate([table.source, np.full(len(points), c)]),
+                noise=np.concatenate([table.noise, np.full((len(points), 3), np.nan)]),
             )
             views = {t: free_of(view, _seen_px(observed, t)) for t, view in views.items()}
         return table
@@ -219,6 +231,7 @@ class Extension:
         views = replace(views, ideal=np.where(fits[..., None], ideal, np.nan))
         views, noise_px = _adjusted_near(
             views,
+            table.noise,
             good,
             self._n_keys,
             BundleOptions(_STEPS[turn], _CAUCHY_PX[turn], _LEAST_GAIN[turn]),
@@ -234,7 +247,7 @@ class Extension:
     def _measured_again(self, table: Table, good: Mask, joined: list[int]) -> Table:
         """Look for patches again from adjusted poses: old ones in new views, new ones in all."""
         cams = self._cams(table)
-        observed = table.observed.copy()
+        observed, noise = table.observed.copy(), table.noise.copy()
         old = np.flatnonzero(good & (table.source < 0))
         known = replace(
             self._old,
@@ -245,14 +258,17 @@ class Extension:
             points_world=table.points[old],
             observed_px=table.observed[old, : self._n_keys],
         )
-        for i in joined:
-            c = self._n_keys + i
+        columns = [self._n_keys + i for i in joined]
+        by_view = np.full((len(old), len(columns), 3), np.nan)
+        for at, c in enumerate(columns):
             which, reference = references(
                 known, self._cameras[c], cams[c], self._relative[old], len(old)
             )
-            found = self._table.found(reference, cams, [c], _AGAIN)[:, c]
+            found = self._table.found(reference, cams, [c], _AGAIN)
             observed[old, c] = np.nan
-            observed[old[which], c] = found
+            observed[old[which], c] = found.pixels[:, c]
+            by_view[which, at] = found.noise[:, c]
+        noise[old] = landmark_noise(by_view)
         fresh = np.flatnonzero(good & (table.source >= 0))
         view = table.source[fresh]
         kept = np.isfinite(table.observed[fresh, view, 0])
@@ -264,9 +280,9 @@ class Extension:
                 table.points[fresh],
                 np.full(len(fresh), _RELATIVE_SIGMA),
             )
-            columns = [*range(self._n_keys), *(self._n_keys + i for i in joined)]
-            observed[fresh] = self._table.found(reference, cams, columns, _AGAIN)
-        return replace(table, observed=observed)
+            found = self._table.found(reference, cams, [*range(self._n_keys), *columns], _AGAIN)
+            observed[fresh], noise[fresh] = found.pixels, landmark_noise(found.noise)
+        return replace(table, observed=observed, noise=noise)
 
     def _growth(self, table: Table, good: Mask, noise_px: float, joined: list[int]) -> Growth:
         columns = [*range(self._n_keys), *(self._n_keys + i for i in joined)]
@@ -300,7 +316,7 @@ def _seen_px(observed: Array, column: int) -> Array:
 
 
 def _adjusted_near(
-    views: Views, good: Mask, n_keys: int, options: BundleOptions
+    views: Views, noise: Array, good: Mask, n_keys: int, options: BundleOptions
 ) -> tuple[Views, float]:
     """Adjust the new views, the old keyframes that share most with them, and what these see.
 
@@ -309,6 +325,7 @@ def _adjusted_near(
 
     Args:
         views: of which the first ``n_keys`` are old.
+        noise: (N, 3) of each landmark (``Table.noise``).
         good: (N,) landmarks to be used.
         n_keys: see above.
         options: of the adjustment.
@@ -338,7 +355,7 @@ def _adjusted_near(
         distances=tuple(replace(d, a=int(place[d.a]), b=int(place[d.b])) for d in views.distances),
         n_held=int(np.sum(~moving)),
     )
-    adjusted, noise_px = adjust(part, options)
+    adjusted, noise_px = adjust_weighed(part, noise[rows], options)
     points = views.points.copy()
     points[rows] = adjusted.points
     bodies = tuple(adjusted.bodies[place[i]] for i in range(len(order)))

@@ -126,7 +126,7 @@ def new_landmarks(
         points,
         np.full(len(row), _RELATIVE_SIGMA),
     )
-    found = table.found(reference, worlds_from_cams, targets, _RULES)
+    found = table.found(reference, worlds_from_cams, targets, _RULES).pixels
     count = np.isfinite(found[:, :, 0]).sum(axis=1)
     best = _best_of_each(row, count)
     best = best[count[best] >= 2]

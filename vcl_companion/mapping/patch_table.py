@@ -77,6 +77,31 @@ class Reference:
     sigma: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Landmarks looked for in V views; NaN where they were not found.
+
+    Attributes:
+        pixels: (M, V, 2) raw px; in the view that the patch is cut from, where it is cut.
+        noise: (M, V, 3) xx xy yy of what the grey levels leave unexplained, px^2; NaN in that view.
+    """
+
+    pixels: Array
+    noise: Array
+
+
+def landmark_noise(noise: Array) -> Array:
+    """Return (M, 3) of (M, V, 3) what the views find that is neither best nor worst; NaN for none.
+
+    Of an even number of views the better one of the two in the middle.
+    """
+    size = noise[:, :, 0] + noise[:, :, 2]
+    rising = np.argsort(size, axis=1)  # what was not found comes last
+    middle = np.maximum(np.isfinite(size).sum(axis=1) - 1, 0) // 2
+    rows = np.arange(len(noise))
+    return np.asarray(noise[rows, rising[rows, middle]])
+
+
 class PatchTable:
     """The images of some views, and where these were taken.
 
@@ -107,8 +132,8 @@ class PatchTable:
         rules: AlignRules,
         reach_px: float = 0.0,
         level: int = 0,
-    ) -> Array:
-        """Return (M, V, 2) where patches are found, the reference included; NaN elsewhere.
+    ) -> Found:
+        """Return where patches are found, the reference included.
 
         Args:
             reference: the patches.
@@ -120,6 +145,7 @@ class PatchTable:
         """
         out = np.full((len(reference.view), len(self._cameras), 2), np.nan)
         out[np.arange(len(reference.view)), reference.view] = reference.pixels
+        noise = np.full((*out.shape[:2], 3), np.nan)
         anchors, fit = self._anchors(reference, worlds_from_cams)
         for i in targets:
             frame = self._pyramids[i]
@@ -135,7 +161,8 @@ class PatchTable:
                 anchors, rows, frame, self._lenses[i], cam_from_world, radii, level, rules
             )
             out[rows[aligned.found], i] = aligned.pixels[aligned.found]
-        return out
+            noise[rows[aligned.found], i] = aligned.noise[aligned.found]
+        return Found(out, noise)
 
     def _comparable(
         self, reference: Reference, rows: Index, worlds_from_cams: list[Pose], i: int

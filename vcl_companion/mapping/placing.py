@@ -130,10 +130,9 @@ def place(
         pose = guess
         for look in looks:
             poses = [*worlds_from_cams, *[pose @ view.body_from_cam] * (table.n_views - n_known)]
-            found = table.found(reference, poses, [column], look.rules, look.reach_px, look.level)[
-                :, column
-            ]
-            result = _judged(view, pose, landmarks, found, known, sure, look.noise_px, options)
+            found = table.found(reference, poses, [column], look.rules, look.reach_px, look.level)
+            at = found.pixels[:, column]
+            result = _judged(view, pose, landmarks, at, known, sure, look.noise_px, options)
             if isinstance(result, NotFound):
                 break
             pose = result.world_from_body

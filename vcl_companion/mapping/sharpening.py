@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from vcl_companion.geometry.camera import Camera
+from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.culling import depth_errors, fitting
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions
@@ -15,11 +16,13 @@ from vcl_companion.mapping.patch_table import (
     PyramidOf,
     Reference,
     decoded_pyramid,
+    landmark_noise,
     pyramids_of,
 )
 from vcl_companion.mapping.strays import strays
 from vcl_companion.mapping.uncertainty import views_of
-from vcl_companion.vision.bundle import BundleOptions, adjust
+from vcl_companion.mapping.weighing import adjust_weighed
+from vcl_companion.vision.bundle import BundleOptions
 from vcl_companion.vision.patches import AlignRules
 
 # A first alignment starts from poses that are some pixels off, the next ones do not.
@@ -83,13 +86,14 @@ def _round(
     )
     cams = [k.world_from_body @ k.body_from_cam for k in landmark_map.keyframes]
     found = table.found(reference, cams, list(range(len(cams))), rules)
-    count = np.isfinite(found[:, :, 0]).sum(axis=1)
+    count = np.isfinite(found.pixels[:, :, 0]).sum(axis=1)
     # The last one written wins: of each landmark the patch that most keyframes find.
     best = np.full(len(landmark_map.points_world), -1, dtype=np.intp)
     rising = np.argsort(count, kind="stable")
     best[landmark[rising]] = rising
     kept = np.flatnonzero(best >= 0)
-    points, observed = landmark_map.points_world[kept], found[best[kept]]
+    points, observed = landmark_map.points_world[kept], found.pixels[best[kept]]
+    noise = landmark_noise(found.noise[best[kept]])
     observed[strays(points, observed, view[best[kept]], cameras, cams)] = np.nan
     seen_twice = np.isfinite(observed[:, :, 0]).sum(axis=1) >= 2
     measured = replace(
@@ -97,12 +101,15 @@ def _round(
     )
     if len(measured.points_world) < options.min_landmarks:
         return measured
-    return _adjusted(measured, cauchy_px, options)
+    return _adjusted(measured, noise[seen_twice], cauchy_px, options)
 
 
-def _adjusted(landmark_map: LandmarkMap, cauchy_px: float, options: MapOptions) -> LandmarkMap:
+def _adjusted(
+    landmark_map: LandmarkMap, noise: Array, cauchy_px: float, options: MapOptions
+) -> LandmarkMap:
     """Adjust a map of patches; leave out what misses by more than patches do."""
-    views, noise_px = adjust(views_of(landmark_map), BundleOptions(cauchy_px=cauchy_px))
+    bundle = BundleOptions(cauchy_px=cauchy_px)
+    views, noise_px = adjust_weighed(views_of(landmark_map), noise, bundle)
     limit_px = max(_MAX_SIGMAS * noise_px, _LEAST_LIMIT_PX)
     fits, good = fitting(views, limit_px, options)
     observed = np.where(fits[..., None], landmark_map.observed_px, np.nan)[good]
