@@ -92,9 +92,9 @@ def _affordable(image: Image, quality: int, most_bytes: int | None) -> int:
 
 def _in_place(image: Image, quality: int) -> bytes:
     """Return an encoded image that is decoded to where the image is."""
-    data, ahead = _encoded(image, quality), np.zeros(2)
-    best, least_px = data, np.inf
+    best, least_px, ahead = b"", np.inf, np.zeros(2)
     for _ in range(_MOST_ROUNDS):
+        data = _encoded(shifted(image, ahead), quality)
         drift = shift_px(image, _pixels(data))
         drift_px = float(np.abs(drift).max())
         if drift_px < least_px:
@@ -102,7 +102,6 @@ def _in_place(image: Image, quality: int) -> bytes:
         if not _DRIFT_PX < drift_px < _MOST_DRIFT_PX:
             break
         ahead -= drift
-        data = _encoded(shifted(image, ahead), quality)
     return best
 
 
