@@ -36,8 +36,8 @@ SHARED_NOISE_PX = 0.085
 ASIDE_NOISE_PX = 0.3
 """At ``ASIDE_DEG``; elsewhere by the power of 1.5 of the angle."""
 ASIDE_DEG = 10.0
-REPEATED_NOISE_PX = 0.29
-_WIDER = 3.7
+REPEATED_NOISE_PX = 0.31
+_WIDER = 3.5
 # No distance between drones is known better; much smaller sigmas overflow.
 _FINEST_M = 1e-6
 # So many landmarks are dealt with at a time: on its way what is known of one takes ten times the
