@@ -16,7 +16,7 @@ from vcl_companion.vision.image_shift import shift_px, shifted
 
 # A smaller drift is none; a larger one comes of noise, or of an image that holds nothing.
 _DRIFT_PX, _MOST_DRIFT_PX = 0.002, 0.25
-_MOST_ROUNDS = 3
+_MOST_CORRECTIONS = 2
 _UNREADABLE = "a keyframe's image cannot be decoded"
 
 
@@ -67,41 +67,44 @@ def encode_image(image: Image, quality: int, most_bytes: int | None = None) -> b
         most_bytes: the quality is lowered until the bytes are no more; what takes more at
             quality 1 stays so.
     """
-    quality = _affordable(image, quality, most_bytes)
-    data = _in_place(image, quality)
+    data, quality = _affordable(image, quality, most_bytes)
+    data = _in_place(image, quality, data)
     while most_bytes is not None and len(data) > most_bytes and quality > 1:
         quality -= 1
-        data = _in_place(image, quality)
+        data = _in_place(image, quality, _encoded(image, quality))
     return data
 
 
-def _affordable(image: Image, quality: int, most_bytes: int | None) -> int:
-    """Return the best quality at which an image, as it is, takes no more bytes than these."""
-    if most_bytes is None or len(_encoded(image, quality)) <= most_bytes:
-        return quality
+def _affordable(image: Image, quality: int, most_bytes: int | None) -> tuple[bytes, int]:
+    """Return an image, as it is, of no more bytes than these, if that can be; and its quality."""
+    data = _encoded(image, quality)
+    if most_bytes is None or len(data) <= most_bytes:
+        return data, quality
     # Six halvings of 1 to 100, each twenty milliseconds; the length rises with the quality.
     fits, too_much = 1, quality
+    best = _encoded(image, fits)
     while too_much - fits > 1:
         between = (fits + too_much) // 2
-        if len(_encoded(image, between)) <= most_bytes:
-            fits = between
+        data = _encoded(image, between)
+        if len(data) <= most_bytes:
+            fits, best = between, data
         else:
             too_much = between
-    return fits
+    return best, fits
 
 
-def _in_place(image: Image, quality: int) -> bytes:
-    """Return an encoded image that is decoded to where the image is."""
-    best, least_px, ahead = b"", np.inf, np.zeros(2)
-    for _ in range(_MOST_ROUNDS):
-        data = _encoded(shifted(image, ahead), quality)
-        drift = shift_px(image, _pixels(data))
-        drift_px = float(np.abs(drift).max())
-        if drift_px < least_px:
-            best, least_px = data, drift_px
-        if not _DRIFT_PX < drift_px < _MOST_DRIFT_PX:
+def _in_place(image: Image, quality: int, plain: bytes) -> bytes:
+    """Return an image encoded so that it is decoded to where it is; ``plain``: as it is."""
+    drift = shift_px(image, _pixels(plain))
+    best, least, ahead = plain, drift, np.zeros(2)
+    for _ in range(_MOST_CORRECTIONS):
+        if not _DRIFT_PX < np.abs(drift).max() < _MOST_DRIFT_PX:
             break
         ahead -= drift
+        data = _encoded(shifted(image, ahead), quality)
+        drift = shift_px(image, _pixels(data))
+        if np.abs(drift).max() < np.abs(least).max():
+            best, least = data, drift
     return best
 
 

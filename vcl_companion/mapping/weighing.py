@@ -9,18 +9,10 @@ which its patch has less texture.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision.bundle import (
-    BundleOptions,
-    Views,
-    adjust,
-    reprojection_residuals,
-    residual_noise_px,
-)
+from vcl_companion.vision.bundle import BundleOptions, Views, adjust
 
 # No patch is found better than this, whatever its grey levels say.
 _LEAST_NOISE_PX = 0.08
@@ -38,12 +30,9 @@ def adjust_weighed(views: Views, noise: Array, options: BundleOptions) -> tuple[
         options: of the adjustment; its robust scale is for a patch of usual noise.
 
     Returns:
-        The adjusted views, and the robust noise of one pixel coordinate, px, all alike.
+        The adjusted views, and the robust noise of one pixel coordinate, px, without weights.
     """
-    weighed = replace(views, slopes=_weights(noise)[:, None] @ views.slopes)
-    adjusted, _ = adjust(weighed, options)
-    adjusted = replace(adjusted, slopes=views.slopes)
-    return adjusted, residual_noise_px(reprojection_residuals(adjusted))
+    return adjust(views, options, _weights(noise))
 
 
 def _weights(noise: Array) -> Array:

@@ -100,19 +100,23 @@ def reprojection_residuals(views: Views) -> Array:
     return kernels.residuals(points, cams, slopes, ideal, _MIN_DEPTH_M)
 
 
-def adjust(views: Views, options: BundleOptions) -> tuple[Views, float]:
+def adjust(
+    views: Views, options: BundleOptions, weights: Array | None = None
+) -> tuple[Views, float]:
     """Move poses and points until the robust reprojection error is least.
 
     Args:
         views: the first estimate. Every point should be seen at least twice.
         options: stopping rule and robust scale.
+        weights: (N, 2, 2) that multiply the residuals of each point; None: all count alike.
 
     Returns:
         The adjusted views, and the robust noise of one pixel coordinate (1
-        sigma, px, from the median absolute residual).
+        sigma, px, from the median absolute residual), without weights.
     """
     damping = 1e-4
-    problem = _Problem(views, options.cauchy_px)
+    slopes = views.slopes if weights is None else weights[:, None] @ views.slopes
+    problem = _Problem(replace(views, slopes=slopes), options.cauchy_px)
     system, cost = problem.system(views, damping), problem.cost(views)
     for _ in range(options.max_iterations):
         step = problem.step(system, damping)
