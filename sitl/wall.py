@@ -17,7 +17,7 @@ import numpy as np
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.drone_view import decode_image, encode_image
+from vcl_companion.mapping.keyframe_image import ImageFormat, decode_image, encode_image
 from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
 from vcl_companion.recording.sensor import BODY_FROM_CAM_FORWARD, Sensor
 from vcl_companion.vision.features import FeatureOptions, Image, detect
@@ -66,9 +66,9 @@ class Scene:
         x, y = self._first_px[0] + place[0], self._first_px[1] + place[1]
         return np.ascontiguousarray(self._picture[y : y + SIZE_PX[1], x : x + SIZE_PX[0]])
 
-    def webp(self, place: tuple[int, int]) -> bytes:
+    def encoded(self, place: tuple[int, int], image_format: ImageFormat = "av1") -> bytes:
         """Return that as it travels."""
-        return encode_image(self.image(place), _QUALITY)
+        return encode_image(self.image(place), _QUALITY, image_format=image_format)
 
     def world_from_body(self, place: tuple[int, int]) -> Pose:
         """Return where a drone is that hovers there."""
@@ -104,7 +104,7 @@ class Scene:
     def _keyframe(self, drone: int, place: tuple[int, int]) -> Keyframe:
         at_ns = int(self._rng.integers(1 << 40))
         pose = self.world_from_body(place)
-        return Keyframe(drone, at_ns, pose, SENSOR.body_from_cam, CAMERA, self.webp(place))
+        return Keyframe(drone, at_ns, pose, SENSOR.body_from_cam, CAMERA, self.encoded(place))
 
     def _points(self, pixels: Array) -> Array:
         off = (pixels - np.array([CAMERA.cx_px, CAMERA.cy_px])) * _WALL_M / _FOCAL_PX

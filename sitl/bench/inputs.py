@@ -13,7 +13,8 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.map_index import MapIndex, index_map
-from vcl_companion.mapping.drone_view import DroneView, decode_image, encode_image
+from vcl_companion.mapping.drone_view import DroneView
+from vcl_companion.mapping.keyframe_image import decode_image, encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.reconstruction import MapOptions, NoMap, reconstruct
 from vcl_companion.recording.images import load_image

@@ -20,7 +20,7 @@ from sitl.renderer import Renderer
 from sitl.scenario import Scenario
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.drone_view import decode_image, encode_image
+from vcl_companion.mapping.keyframe_image import decode_image, encode_image
 from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
 from vcl_companion.vision.features import FeatureOptions, detect
 

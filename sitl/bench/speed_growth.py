@@ -19,7 +19,7 @@ from sitl.scenario import Scenario
 from vcl_companion.daemon.map_offer import ReadyMap
 from vcl_companion.localization.intra import localize_intra
 from vcl_companion.localization.map_index import index_map
-from vcl_companion.mapping.drone_view import decode_image
+from vcl_companion.mapping.keyframe_image import decode_image
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.templates import prepare_templates
 from vcl_companion.vision.features import Features, detect

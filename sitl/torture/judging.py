@@ -13,7 +13,7 @@ from sitl.torture.dice import Dice
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.errors import WireError
 from vcl_companion.links.messages import Tunnel
-from vcl_companion.mapping.drone_view import decode_image
+from vcl_companion.mapping.keyframe_image import decode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.swarm.transfer import BlobKind
 from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame, encode_frame

@@ -16,7 +16,7 @@ from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import exp_so3
-from vcl_companion.mapping.drone_view import encode_image
+from vcl_companion.mapping.keyframe_image import IMAGE_FORMATS, encode_image
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.swarm.transfer import BlobKind
 from vcl_companion.wire.chunks import MAX_CHUNKS, Reply, TransferStatus, receiving_statuses
@@ -77,7 +77,11 @@ class Valid:
         self._dice = dice
         self._heard = heard
         self.scene = Scene(dice.rng)
-        self._images = [self.scene.webp(self.scene.place()) for _ in range(8)]
+        self._images = [
+            self.scene.encoded(self.scene.place(), image_format)
+            for image_format in IMAGE_FORMATS
+            for _ in range(4)
+        ]
         first = encode_map(self.scene.first_map(peers))
         self._first_maps = [first, encode_map(self.scene.first_map(peers[:2]))]
         self._next_of = b""

@@ -21,7 +21,7 @@ from vcl_companion.localization.intra import LocalizationOptions
 from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.tracking import TrackingOptions
-from vcl_companion.mapping.drone_view import encode_image
+from vcl_companion.mapping.keyframe_image import encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.reconstruction import MapOptions
 from vcl_companion.mapping.templates import Templates, prepare_templates

@@ -9,7 +9,7 @@ import pytest
 
 from tests.daemon import demo
 from vcl_companion.daemon.feature_memory import FeatureMemory
-from vcl_companion.mapping.drone_view import decode_image
+from vcl_companion.mapping.keyframe_image import decode_image
 from vcl_companion.vision.features import detect
 from vcl_companion.wire.map_codec import decode_map
 

@@ -10,7 +10,7 @@ from tests.daemon import demo
 from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_building import build_map
 from vcl_companion.geometry.camera import Camera
-from vcl_companion.mapping.drone_view import encode_image
+from vcl_companion.mapping.keyframe_image import encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.reconstruction import NoMap
 from vcl_companion.wire.frame_codec import FrameAnswer

@@ -19,7 +19,7 @@ from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.map_index import index_map
-from vcl_companion.mapping.drone_view import encode_image
+from vcl_companion.mapping.keyframe_image import encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
 

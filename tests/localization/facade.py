@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.drone_view import decode_image, encode_image
+from vcl_companion.mapping.keyframe_image import decode_image, encode_image
 from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
 from vcl_companion.recording.sensor import BODY_FROM_CAM_FORWARD
 from vcl_companion.vision.features import Detector, FeatureOptions, Features, Image, detect

@@ -17,7 +17,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3
 from vcl_companion.localization.intra import LocalizationOptions, Localized, Prior
 from vcl_companion.localization.tracking import TrackingOptions, track
-from vcl_companion.mapping.drone_view import encode_image
+from vcl_companion.mapping.keyframe_image import encode_image
 from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
 from vcl_companion.mapping.templates import prepare_templates
 from vcl_companion.mapping.uncertainty import map_uncertainty

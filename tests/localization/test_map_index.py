@@ -24,7 +24,7 @@ from vcl_companion.localization.intra import (
     localize_intra,
 )
 from vcl_companion.localization.map_index import index_map
-from vcl_companion.mapping.drone_view import decode_image, encode_image
+from vcl_companion.mapping.keyframe_image import decode_image, encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.vision.features import FeatureOptions, Features, detect
 from vcl_companion.wire.map_codec import decode_map, encode_map
@@ -133,11 +133,13 @@ def test_images_that_cannot_be_used_are_refused() -> None:
     landmark_map = photographed()
     first, second = landmark_map.keyframes
     small = encode_image(np.zeros((24, 32), np.uint8), 50)
+    webp = encode_image(decode_image(second.image_bytes, second.camera), 50, image_format="webp")
     for image, reason in (
-        (b"", "no WebP"),
-        (b"RIFF" + bytes(60), "no WebP"),
-        (small, r"320x240: \(32, 24\)"),
-        (first.image_bytes[:2000], "cannot be decoded"),
+        (b"", "neither an AV1"),
+        (b"RIFF" + bytes(60), "neither an AV1"),
+        (small, r"320x240 pixels: \(32, 24\)"),
+        (first.image_bytes[:2000], "neither an AV1"),
+        (webp[:2000], "cannot be decoded"),
     ):
         broken = replace(second, image_bytes=image)
         with pytest.raises(ValueError, match=reason):

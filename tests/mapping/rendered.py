@@ -7,7 +7,8 @@ import numpy as np
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.mapping.drone_view import DroneView, decode_image, encode_image
+from vcl_companion.mapping.drone_view import DroneView
+from vcl_companion.mapping.keyframe_image import decode_image, encode_image
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.vision.features import FeatureOptions, Image, detect
 

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vcl_companion.mapping.drone_view import DroneView, decode_image, encode_image
+from vcl_companion.mapping.drone_view import DroneView
+from vcl_companion.mapping.keyframe_image import decode_image, encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.reconstruction import reconstruct

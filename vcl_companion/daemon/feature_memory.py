@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.drone_view import decode_image
+from vcl_companion.mapping.keyframe_image import decode_image
 from vcl_companion.mapping.landmark_map import Keyframe
 from vcl_companion.vision.features import Detector, FeatureOptions, Features, detect
 from vcl_companion.vision.patches import Pyramid, pyramid_of

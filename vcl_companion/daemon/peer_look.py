@@ -14,7 +14,7 @@ from vcl_companion.localization.inter import NoProposal, Proposal, localize_inte
 from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.localization.pair_evidence import Observer
 from vcl_companion.localization.pose_filter import FilterState, north_aligned
-from vcl_companion.mapping.drone_view import decode_image
+from vcl_companion.mapping.keyframe_image import decode_image
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.vision.features import Detector, FeatureOptions, Features, Image, detect

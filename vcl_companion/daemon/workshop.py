@@ -24,7 +24,7 @@ from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pipeline import Effort, PipelineOptions, localize
 from vcl_companion.localization.pose_filter import FilterState
 from vcl_companion.mapping.continuity import newest_part
-from vcl_companion.mapping.drone_view import encode_image
+from vcl_companion.mapping.keyframe_image import encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.recording.sensor import Sensor
@@ -108,7 +108,7 @@ class Workshop:
 
     def encode(self, image: Image, quality: int, most_bytes: int) -> bytes:
         """Return one of our frames as a host gets it, to say where it was; see ``encode_image``."""
-        return encode_image(image, quality, most_bytes)
+        return encode_image(image, quality, most_bytes, self._options.map.image_format)
 
     def encode_keyframe(self, image: Image, most_bytes: int, detail: Detail) -> bytes:
         """Return one of our frames as all get it, for a map; see ``encode_image``.
@@ -120,11 +120,11 @@ class Workshop:
         """
         options = self._options.map
         if detail == "all" or not options.patches:
-            return encode_image(image, options.keyframe_quality, most_bytes)
+            return self.encode(image, options.keyframe_quality, most_bytes)
         strongest = FeatureOptions(max_features=options.update_features)
         corners = detect(image, self._options.detectors[0], strongest).pixels
         quality = options.update_quality if detail == "coarse" else options.keyframe_quality
-        return encode_image(focused(image, corners), quality, most_bytes)
+        return self.encode(focused(image, corners), quality, most_bytes)
 
     def signature(self, image: Image) -> bytes:
         """Return what tells peers the place that an image shows; see ``signature_of``."""

@@ -33,7 +33,7 @@ class Keyframe:
         world_from_body: where that drone was.
         body_from_cam: its camera's mounting.
         camera: its camera's intrinsics.
-        image_bytes: the encoded image (WebP), byte for byte as exchanged.
+        image_bytes: the encoded image, byte for byte as exchanged.
     """
 
     drone_id: int

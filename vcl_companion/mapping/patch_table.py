@@ -16,7 +16,7 @@ import numpy as np
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.drone_view import decode_image
+from vcl_companion.mapping.keyframe_image import decode_image
 from vcl_companion.mapping.known_features import Index
 from vcl_companion.mapping.surfaces import slopes_of
 from vcl_companion.vision.patches import (

@@ -15,10 +15,11 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.mapping.continuity import broken_continuity, pruned
 from vcl_companion.mapping.correspondences import Correspondences, unique
-from vcl_companion.mapping.drone_view import DroneView, decode_image
+from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.extension import Extension, ImageFeatures
 from vcl_companion.mapping.growth import Growth, grown
 from vcl_companion.mapping.joining import Joined, join, join_nearby
+from vcl_companion.mapping.keyframe_image import decode_image
 from vcl_companion.mapping.known_features import KeyframeLibrary, of_keyframes
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.late_joining import join_together

@@ -27,7 +27,7 @@ class InterMavOptions(InterOptions):
             carry the request.
         max_hosts: peers asked at once; fewer where the link takes too long for so many.
         detector: features to match two drones' images by; among the map's.
-        request_quality: WebP quality of the frame that is sent, 1 to 100, at most.
+        request_quality: of the frame that is sent, 1 to 100, at most; see ``map.image_format``.
         request_bytes: of its image, at most: the quality is lowered for it.
     """
 
@@ -38,7 +38,7 @@ class InterMavOptions(InterOptions):
     wait_s: float = 1.0
     max_hosts: int = 2
     detector: Detector = "sift"
-    request_quality: int = 60
+    request_quality: int = 45
     request_bytes: int = 11_500
 
     def __post_init__(self) -> None:

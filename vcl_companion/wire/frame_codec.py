@@ -61,7 +61,7 @@ class FrameAnswer:
             instant, or None if it had none.
         body_from_cam: its camera's mounting.
         camera: its camera's intrinsics.
-        image_bytes: the encoded image (WebP).
+        image_bytes: the encoded image, see ``mapping/keyframe_image.py``.
         world_from_body: where that drone believes that it was, on the map that it
             flew on; None when it does not know.
         has_heading: whether the attitude's heading is by the world's north, as far as
