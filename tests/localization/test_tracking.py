@@ -225,6 +225,20 @@ def test_a_lens_that_is_off_does_not_average_out(
     assert own[1] < 20.0
 
 
+def test_no_position_is_told_better_than_a_camera_s_place_on_its_drone(
+    rng: np.random.Generator, templates: Templates
+) -> None:
+    image, prior = photograph(BODIES[0], rng), near(rng, BODIES[0])
+    covariances = []
+    for mounted_m in (1e-6, 0.01):
+        options = replace(OPTIONS, mounted_m=mounted_m)
+        fix = tracked(image, templates, prior, options=options)
+        covariances.append(fix.covariance())
+    assert np.linalg.eigvalsh(covariances[1][:3, :3])[0] > 0.01**2
+    expected = np.diag([0.01**2 - 1e-12] * 3 + [0.0] * 3)
+    np.testing.assert_allclose(covariances[1] - covariances[0], expected, atol=1e-12)
+
+
 def test_what_is_seen_where_a_keyframe_saw_it_is_shifted_no_more_than_there(
     rng: np.random.Generator, templates: Templates
 ) -> None:
@@ -308,6 +322,7 @@ def test_the_same_frame_gives_the_same_pose(rng: np.random.Generator, templates:
         {"max_radius_px": 0.0},
         {"misplaced_px": -1.0},
         {"shifted_px": 0.0},
+        {"mounted_m": 0.0},
     ],
 )
 def test_options_out_of_bounds_are_refused(wrong: dict[str, float]) -> None:

@@ -66,6 +66,8 @@ class TrackingOptions:
             many landmarks there are, this does not average out. Where most patches lie nearly
             where the same drone's camera saw them in its keyframes, all that is alike, and it is
             less.
+        mounted_m: how well it is known where the camera sits on its drone, per axis: no position
+            is told better, however near the map's first keyframes.
     """
 
     n_landmarks: int = 400
@@ -79,6 +81,7 @@ class TrackingOptions:
     misplaced_px_per_octave: float = 0.03
     misplaced_by_residual: float = 0.7
     shifted_px: float = 0.03
+    mounted_m: float = 0.0007
 
     def __post_init__(self) -> None:
         if not 20 <= self.n_coarse <= self.n_landmarks:
@@ -96,6 +99,7 @@ class TrackingOptions:
             "misplaced_px_per_octave",
             "misplaced_by_residual",
             "shifted_px",
+            "mounted_m",
         ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
@@ -300,7 +304,10 @@ class _Tracker:
         fix = Localized(
             pose,
             _ROBUST_LOSS * by_noise,
-            _ROBUST_LOSS * by_misplacement + by_landmarks + self._by_shift(found.of(agrees)),
+            _ROBUST_LOSS * by_misplacement
+            + by_landmarks
+            + self._by_shift(found.of(agrees))
+            + np.diag([self._options.mounted_m**2] * 3 + [0.0] * 3),
             lever,
             uncertainty.keyframe_covariance,
             n_tried,
