@@ -43,8 +43,9 @@ _LOOK_S = 0.1
 # A camera that delivers nothing new has nothing for a map either.
 _STALE_NS = 60 * 1_000_000_000
 
-# Who has less than this share of our landmarks in sight looks elsewhere by now.
-_LEAST_SEEN = 0.5
+# Who has less than this share of our landmarks in sight looks elsewhere by now, or soon: its word
+# is a second old, and one that turns away fast needs its view in this update, not in the next.
+_LEAST_SEEN = 0.65
 # Whoever has been heard by us is heard by all a moment later, and is sent what all are sent.
 _ACQUAINTED_S = 0.5
 # Nobody needs longer than so many times the patience to hand over a map, whatever trickles in.
