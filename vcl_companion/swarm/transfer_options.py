@@ -30,7 +30,7 @@ class Pace:
             again (longer every time it gets none); a receiver answers within it.
         give_up_s: a sender without progress for this long fails.
         image_bytes: of a keyframe's image, at most: its quality is lowered for it. Of 9 kB
-            maps are a centimetre or two worse (docs/network.md).
+            maps are a centimetre worse (docs/network.md).
         quick_s: who comes to a swarm with a map waits for no more of it at first than takes so
             long to send (``daemon/map_parts.py``).
     """
