@@ -17,7 +17,8 @@ class MapOptions:
         detectors: features that the map is made of; SIFT makes the better geometry
             from far apart, and those of the localization must be among them.
         image_format: in which images are exchanged; all read both. ``av1`` takes an OpenCV that
-            writes it; ``webp`` 80 and 36 are as good as ``av1`` 60 and 40, and a quarter longer.
+            writes it; ``webp`` 80 and 36 are as good as ``av1`` 60 and 40, and a quarter
+            longer, of noisy images twice as long.
         keyframe_quality: of exchanged images, 1 to 100 of their format's own scale.
         update_quality: of those that extend a map: what they are for is found by its patches.
         update_features: images that extend a map keep their detail around so many of their

@@ -1,4 +1,6 @@
-"""Grey images as single AV1 pictures: a fifth fewer bytes than WebP for as much detail.
+"""Grey images as single AV1 pictures: fewer bytes than WebP for as much detail.
+
+A sixth to a quarter fewer, a half of an image with sensor noise, and nothing is shifted.
 
 An AVIF file is such a picture in a container of 270 bytes that says once more what the picture
 says itself. Only the picture is exchanged, and whoever gets it makes the container: a stranger's
