@@ -29,7 +29,7 @@ DETECTORS: tuple[Detector, ...] = ("akaze", "sift", "orb")
 
 # A drone other than the leader, two seconds after the map.
 _DRONE, _FRAME = 1, 10
-_QUALITY = 80
+_QUALITY = 60
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,12 +32,12 @@ _SINGULAR = 1e-11
 # what stands out, and what a surface mirrors, are then seen otherwise altogether. And from one look
 # at a landmark to the next it does not change its sign: a further one tells the less, the more
 # rounds have seen it before. Poses' NEES is so on rendered flights and on photographs.
-SHARED_NOISE_PX = 0.07
+SHARED_NOISE_PX = 0.085
 ASIDE_NOISE_PX = 0.3
 """At ``ASIDE_DEG``; elsewhere by the power of 1.5 of the angle."""
 ASIDE_DEG = 10.0
 REPEATED_NOISE_PX = 0.31
-_WIDER = 3.8
+_WIDER = 3.5
 # No distance between drones is known better; much smaller sigmas overflow.
 _FINEST_M = 1e-6
 # So many landmarks are dealt with at a time: on its way what is known of one takes ten times the
