@@ -29,7 +29,6 @@ DETECTORS: tuple[Detector, ...] = ("akaze", "sift", "orb")
 
 # A drone other than the leader, two seconds after the map.
 _DRONE, _FRAME = 1, 10
-_QUALITY = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +135,7 @@ def _view(drone: Drone, number: int, origin: Array) -> View:
 
 
 def _drone_view(drone_id: int, view: View) -> DroneView:
-    sent = encode_image(view.image, _QUALITY)
+    sent = encode_image(view.image, MapOptions().keyframe_quality)
     image = decode_image(sent, view.camera)
     return DroneView(
         drone_id,
