@@ -191,7 +191,11 @@ class Chain:
             drone.sensor.body_from_cam, drone.sensor.camera,
             self._workshop.encode_keyframe(image, _MOST_BYTES, detail),
         )  # fmt: skip
-        return answer if fix is None else replace(answer, world_from_body=fix.world_from_body)
+        if fix is None:
+            return answer
+        where = Prior(fix.world_from_body, fix.covariance())
+        seen = self._workshop.seen(image, self._current.stored().revision, where)
+        return replace(answer, world_from_body=fix.world_from_body, seen=seen)
 
     def _image(self, i: int) -> Image:
         drone = self._drones[i]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import exp_so3
 from vcl_companion.mapping.keyframe_image import IMAGE_FORMATS, encode_image
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
+from vcl_companion.mapping.seen_landmarks import SeenLandmarks
 from vcl_companion.swarm.transfer import BlobKind
 from vcl_companion.wire.chunks import MAX_CHUNKS, Reply, TransferStatus, receiving_statuses
 from vcl_companion.wire.frame_codec import FrameAnswer, encode_frame
@@ -170,7 +171,7 @@ class Valid:
         is_odd = camera is not CAMERA and camera.width_px < 100
         image = _blank(camera) if is_odd and dice.below(2) else dice.pick(self._images)
         attitude = self._pose(0.0).quaternion() if dice.below(3) else None
-        return FrameAnswer(
+        frame = FrameAnswer(
             drone_id=peer if dice.below(8) else 1 + dice.below(255),
             request_id=self._number(self._heard.wanted),
             captured_at_ns=dice.word() << dice.below(31),
@@ -181,6 +182,17 @@ class Valid:
             image_bytes=image,
             world_from_body=self._pose(1.0) if dice.below(2) else None,
         )
+        tells = frame.world_from_body is not None and dice.below(2)
+        return replace(frame, seen=self._seen()) if tells else frame
+
+    def _seen(self) -> SeenLandmarks:
+        """Return what a frame may show of the map in use, or of none."""
+        stored, rng = self._heard.stored, self._dice.rng
+        n_landmarks = self._dice.pick((1, 500)) if stored is None else stored.n_landmarks
+        n_seen = min(1 + self._dice.below(400), n_landmarks)
+        landmarks = np.sort(rng.choice(n_landmarks, n_seen, replace=False))
+        aside_px = np.clip(rng.normal(0.0, self._dice.pick((0.1, 3.0)), (n_seen, 2)), -4.0, 4.0)
+        return SeenLandmarks(self._revision(), landmarks, aside_px)
 
     def _frame_answer(self, peer: int) -> tuple[BlobKind, bytes]:
         return BlobKind.FRAME_ANSWER, encode_frame(self.frame(peer))

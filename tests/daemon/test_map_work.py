@@ -17,7 +17,8 @@ from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.errors import WireError
-from vcl_companion.localization.intra import LocalizationOptions, Localized
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.localization.intra import LocalizationOptions, Localized, Prior
 from vcl_companion.localization.pipeline import ALL_EFFORT, PipelineOptions
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.mapping.landmark_map import LandmarkMap
@@ -87,6 +88,23 @@ def test_a_map_that_it_has_not_seen_is_handed_over_and_extended(work: MapWork) -
         assert built.parent == revision_of(PAIR)
         handed = await work.encoded(built, pair())
         assert 0 < len(handed.update) < len(handed.data)
+
+    run(check())
+
+
+def test_what_a_frame_shows_of_a_map_is_told_of_that_map(work: MapWork) -> None:
+    async def check() -> None:
+        stored = replace(pair(), templates=demo.templates(1, 2))
+        where = Prior(demo.world_from_body(2, 6), np.diag(np.repeat([0.02, 0.002], 3) ** 2))
+        seen = await work.seen(demo.shot(2, 6).image, stored, where)
+        assert seen is not None
+        assert seen.revision == stored.revision
+        assert len(seen.landmarks) > 50
+        assert np.median(np.abs(seen.aside_px)) < 1.0
+        away = replace(where, world_from_body=Pose(np.eye(3), np.array([900.0, 0.0, 0.0])))
+        assert await work.seen(demo.shot(2, 6).image, stored, away) is None
+        untracked = replace(pair(), revision=b"untracke")
+        assert await work.seen(demo.shot(2, 6).image, untracked, where) is None
 
     run(check())
 

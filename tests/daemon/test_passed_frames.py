@@ -6,6 +6,7 @@ import asyncio
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.daemon import demo
@@ -15,6 +16,8 @@ from tests.wire.samples import small_frame
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.errors import WireError
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.mapping.seen_landmarks import SeenLandmarks
 from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.transfer import BlobKind
 from vcl_companion.swarm.updates import UpdateOptions
@@ -72,6 +75,15 @@ def test_a_frame_goes_to_everybody_who_did_not_take_it_and_once() -> None:
     assert one.frames.on_their_way_to(3) == {of_two}
     one.frames.pass_on(own)  # what failed is tried again
     assert [peer for peer, _ in one.handed] == [2, 3, 3, 3]
+
+
+def test_what_an_image_shows_of_the_map_is_for_the_coordinator_alone() -> None:
+    one = Member(1)
+    seen = SeenLandmarks(b"revision", np.array([3, 7]), np.zeros((2, 2)))
+    here = replace(frame_of(2, b"of two"), world_from_body=Pose.identity(), seen=seen)
+    one.frames.pass_on(here)
+    ((peer, blob),) = one.handed
+    assert (peer, decode_frame(blob, BlobKind.PASSED_FRAME).seen) == (3, None)
 
 
 def test_what_all_have_heard_is_not_passed_on_and_held_by_who_says_so() -> None:

@@ -177,6 +177,9 @@ class FrameAnswers:
         image_bytes = await self._work.encode_keyframe(
             np.asarray(frame.image), self._image_bytes, detail
         )
+        stored, seen = self._maps.current, None
+        if stored is not None and state is not None and stored.templates is not None:
+            seen = await self._work.seen(np.asarray(frame.image), stored, state.prior())
         return FrameAnswer(
             drone_id=self._system_id,
             request_id=request_id,
@@ -188,6 +191,7 @@ class FrameAnswers:
             image_bytes=image_bytes,
             world_from_body=None if state is None else state.world_from_body,
             has_heading=has_heading,
+            seen=seen,
         )
 
     async def detail(self, frame: Frame) -> Detail:

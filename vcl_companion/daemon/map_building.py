@@ -5,6 +5,8 @@ The next revision may also come of another map, of drones that were on their own
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.rotation import matrix_from_quaternion
@@ -14,6 +16,7 @@ from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.merging import merged
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.reconstruction import reconstruct
+from vcl_companion.mapping.seen_landmarks import told_pixels
 from vcl_companion.mapping.update import extended
 from vcl_companion.vision.features import Features
 from vcl_companion.wire.frame_codec import FrameAnswer
@@ -75,7 +78,7 @@ def update_map(
         image cannot be used, or that came twice, is left out.
     """
     shown = {(f.drone_id, f.captured_at_ns): f for f in frames}
-    views = [_seen(shown[key], ()) for key in sorted(shown)]
+    views = [_told(shown[key], stored) for key in sorted(shown)]
     made = extended(
         stored.index.landmark_map,
         stored.revision,
@@ -133,6 +136,17 @@ def _view(frame: FrameAnswer, map_options: MapOptions, memory: FeatureMemory) ->
     except ValueError as error:
         return NoMap(str(error))
     return _seen(frame, features)
+
+
+def _told(frame: FrameAnswer, stored: StoredMap) -> DroneView:
+    """Make of a frame what a map is extended by: with what its drone tells that it shows of it."""
+    view = _seen(frame, ())
+    if frame.world_from_body is None:
+        return view
+    world_from_cam = frame.world_from_body @ frame.body_from_cam
+    landmark_map = stored.index.landmark_map
+    told = told_pixels(frame.seen, stored.revision, landmark_map, frame.camera, world_from_cam)
+    return replace(view, told_px=told)
 
 
 def _seen(frame: FrameAnswer, features: tuple[Features, ...]) -> DroneView:

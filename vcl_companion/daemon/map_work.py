@@ -22,6 +22,7 @@ from vcl_companion.localization.pipeline import Effort
 from vcl_companion.localization.pose_filter import FilterState
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import NoMap
+from vcl_companion.mapping.seen_landmarks import SeenLandmarks
 from vcl_companion.vision.features import Image
 from vcl_companion.wire.frame_codec import FrameAnswer
 
@@ -57,6 +58,13 @@ class MapWork:
         """See ``Workshop``."""
         data: bytes = await self._do(_IMAGES, "encode_keyframe", image, most_bytes, detail)
         return data
+
+    async def seen(self, image: Image, stored: StoredMap, where: Prior) -> SeenLandmarks | None:
+        """See ``Workshop``."""
+        seen: SeenLandmarks | None = await self._do_with(
+            stored, _IMAGES, "seen", image, stored.revision, where
+        )
+        return seen
 
     async def signature(self, image: Image) -> bytes:
         """See ``Workshop``."""

@@ -12,7 +12,7 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.errors import WireError
@@ -144,7 +144,7 @@ class PassedFrames:
             elif state is not None and not state.revision:
                 continue  # it has no map that an update could be of: that comes first
             elif name not in there.held and name not in there.on_their_way.values():
-                blob = blob or encode_frame(frame, BlobKind.PASSED_FRAME)
+                blob = blob or encode_frame(replace(frame, seen=None), BlobKind.PASSED_FRAME)
                 there.on_their_way[self._hand(peer, blob)] = name
 
     def ended(self, peer: int, transfer_id: int, *, delivered: bool) -> None:

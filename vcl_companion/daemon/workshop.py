@@ -23,10 +23,12 @@ from vcl_companion.localization.intra import Localized, NotLocalized, Prior
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pipeline import Effort, PipelineOptions, localize
 from vcl_companion.localization.pose_filter import FilterState
+from vcl_companion.localization.seen_by_patches import seen_by_patches
 from vcl_companion.mapping.continuity import newest_part
 from vcl_companion.mapping.keyframe_image import encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
+from vcl_companion.mapping.seen_landmarks import SeenLandmarks
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.vision.features import Detector, FeatureOptions, Image, detect
@@ -41,6 +43,8 @@ from vcl_companion.wire.map_update import encode_map_update
 _N_MAPS = 2
 # Beside a map's keyframes, the frames of a round: one of each contributor, several of who is lost.
 _N_NEW_IMAGES = 16
+# Landmarks whose place in a frame is told: more of them fix its pose no better.
+_MOST_SEEN = 800
 # Less of a map would not tell where one is.
 _LEAST_KEYFRAMES, _LEAST_LANDMARKS = 2, 100
 
@@ -125,6 +129,22 @@ class Workshop:
         corners = detect(image, self._options.detectors[0], strongest).pixels
         quality = options.update_quality if detail == "coarse" else options.keyframe_quality
         return self.encode(focused(image, corners), quality, most_bytes)
+
+    def seen(self, image: Image, revision: bytes, where: Prior) -> SeenLandmarks | None:
+        """Return where one of our frames shows landmarks of a map; see ``seen_by_patches``.
+
+        Args:
+            image: (H, W) uint8.
+            revision: of the map.
+            where: the frame was taken, to a pixel.
+        """
+        templates = self._named(revision).templates
+        if templates is None:
+            return None
+        return seen_by_patches(
+            image, self._sensor.camera, self._sensor.body_from_cam, templates, revision,
+            where, self._options.pipeline.tracking, _MOST_SEEN,
+        )  # fmt: skip
 
     def signature(self, image: Image) -> bytes:
         """Return what tells peers the place that an image shows; see ``signature_of``."""

@@ -27,6 +27,8 @@ class DroneView:
         world_from_body: where the drone's own localization on the map puts it, or None.
         has_heading: whether the attitude's heading is by the north of the others; else only its
             roll and pitch count.
+        told_px: (N, 2) where the image, before it was encoded, shows the landmarks of the map that
+            it extends, raw px; NaN where that is not told. None: of none.
     """
 
     drone_id: int
@@ -38,6 +40,7 @@ class DroneView:
     features: tuple[Features, ...]
     world_from_body: Pose | None = None
     has_heading: bool = True
+    told_px: Array | None = None
 
     @property
     def pixels(self) -> Array:

@@ -56,6 +56,8 @@ _NEAREST, _SHARED = 9, 40
 # Residuals of patches that are the same spot: first loosely, by poses not adjusted yet.
 _LIMIT_PX, _CAUCHY_PX = (1.5, 0.5), (0.5, SETTLED_CAUCHY_PX)
 _MAX_SIGMAS = 4.0
+# An encoder shifts no patch that is found again by more.
+_TOLD_PX = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +268,9 @@ class Extension:
             )
             found = self._table.found(reference, cams, [c], _AGAIN)
             observed[old, c] = np.nan
-            observed[old[which], c] = found.pixels[:, c]
+            observed[old[which], c] = _told(
+                found.pixels[:, c], self._views[joined[at]].told_px, old[which]
+            )
             by_view[which, at] = found.noise[:, c]
         noise[old] = landmark_noise(by_view)
         fresh = np.flatnonzero(good & (table.source >= 0))
@@ -308,6 +312,18 @@ class Extension:
 
     def _cams(self, table: Table) -> list[Pose]:
         return [b @ m for b, m in zip(table.bodies, self._mountings, strict=True)]
+
+
+def _told(found: Array, told_px: Array | None, landmarks: Index) -> Array:
+    """Return (M, 2) what is found of landmarks in an encoded image, by the image itself if told.
+
+    Only where both are about the same: what a peer tells is never taken without the image.
+    """
+    if told_px is None:
+        return found
+    told = told_px[landmarks]
+    agrees = np.linalg.norm(told - found, axis=1) < _TOLD_PX  # never where one of both is not there
+    return np.where(agrees[:, None], told, found)
 
 
 def _seen_px(observed: Array, column: int) -> Array:

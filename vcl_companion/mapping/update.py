@@ -139,7 +139,8 @@ def _grown(
         return growth or NoMap("no view joins the map by its patches")
     if growth is None:
         return _by_features(old, sure, views, features_of, options, seed, pyramid_of, matches)
-    waiting = [v for i, v in enumerate(views) if i not in growth.views]
+    # What they tell is of the landmarks of the old map, whose rows are others by now.
+    waiting = [replace(v, told_px=None) for i, v in enumerate(views) if i not in growth.views]
     if not waiting:
         return growth
     known = growth.landmark_map

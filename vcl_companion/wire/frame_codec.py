@@ -15,6 +15,7 @@ from vcl_companion.errors import WireError
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.mapping.seen_landmarks import SeenLandmarks
 from vcl_companion.wire.header import (
     HEADER_BYTES,
     MAX_BLOB_BYTES,
@@ -34,6 +35,7 @@ from vcl_companion.wire.pose_codec import (
     take_rotation,
 )
 from vcl_companion.wire.reader import Reader
+from vcl_companion.wire.seen_codec import encode_seen, take_seen
 
 # After version and kind
 # | 2  | u8  | drone (system id), not 0                                       |
@@ -41,11 +43,12 @@ from vcl_companion.wire.reader import Reader
 # | 7  | u64 | captured at, ns, the sender's own clock, below 2^63            |
 # | 15 | f64 | age of the frame when it was sent, s                           |
 # | 23 | u8  | a sum: 1 an attitude follows, 2 the drone's own pose, 4 the    |
-# |    |     | attitude's heading is by no north that others know             |
+# |    |     | attitude's heading is by no north that others know, 8 where    |
+# |    |     | the image shows a map's landmarks; 8 only with 2               |
 # | 24 | rotation ned_from_body if so, pose world_from_body if so, pose body_from_cam, camera, |
-# |    | image: see pose_codec                                                                 |
+# |    | image: see pose_codec; what the image shows if so: see seen_codec                     |
 _HEAD = struct.Struct("<BIQdB")
-_HAS_ATTITUDE, _HAS_POSE, _HAS_NO_HEADING = 1, 2, 4
+_HAS_ATTITUDE, _HAS_POSE, _HAS_NO_HEADING, _HAS_SEEN = 1, 2, 4, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +69,8 @@ class FrameAnswer:
             flew on; None when it does not know.
         has_heading: whether the attitude's heading is by the world's north, as far as
             that drone knows; else only its roll and pitch tell others anything.
+        seen: where the image, before it was encoded, shows landmarks of the map that the
+            pose is on; None where that is not told.
     """
 
     drone_id: int
@@ -78,12 +83,15 @@ class FrameAnswer:
     image_bytes: bytes
     world_from_body: Pose | None = None
     has_heading: bool = True
+    seen: SeenLandmarks | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.drone_id <= 255 or not 0 <= self.captured_at_ns < 1 << 63:
             raise ValueError(f"a frame of drone {self.drone_id} at {self.captured_at_ns} ns")
         check_request_id(self.request_id)
         check_age(self.frame_age_s)
+        if self.seen is not None and self.world_from_body is None:
+            raise ValueError("a frame that shows landmarks is of a drone that knows where it was")
         if self.ned_from_body is None:
             return
         quaternion = np.array(self.ned_from_body, dtype=np.float64)
@@ -112,6 +120,7 @@ def encode_frame_body(frame: FrameAnswer) -> bytes:
     """
     attitude = b"" if frame.ned_from_body is None else encode_rotation(frame.ned_from_body)
     pose = b"" if frame.world_from_body is None else encode_pose(frame.world_from_body)
+    seen = b"" if frame.seen is None else encode_seen(frame.seen)
     return b"".join(
         [
             _HEAD.pack(
@@ -121,13 +130,15 @@ def encode_frame_body(frame: FrameAnswer) -> bytes:
                 frame.frame_age_s,
                 _HAS_ATTITUDE * bool(attitude)
                 + _HAS_POSE * bool(pose)
-                + _HAS_NO_HEADING * (not frame.has_heading),
+                + _HAS_NO_HEADING * (not frame.has_heading)
+                + _HAS_SEEN * bool(seen),
             ),
             attitude,
             pose,
             encode_pose(frame.body_from_cam),
             encode_camera(frame.camera),
             encode_image(frame.image_bytes),
+            seen,
         ]
     )
 
@@ -152,12 +163,13 @@ def decode_frame(data: bytes, kind: BlobKind = BlobKind.FRAME_ANSWER) -> FrameAn
 def take_frame_body(reader: Reader) -> FrameAnswer:
     """Return the frame that comes next, or raise WireError."""
     drone_id, request_id, captured_at_ns, age_s, has = reader.unpack(_HEAD)
-    if has > _HAS_ATTITUDE + _HAS_POSE + _HAS_NO_HEADING:
+    if has > _HAS_ATTITUDE + _HAS_POSE + _HAS_NO_HEADING + _HAS_SEEN:
         raise WireError(f"frame answer: unknown contents {has}")
     attitude = take_rotation(reader) if has & _HAS_ATTITUDE else None
     world_from_body = take_pose(reader) if has & _HAS_POSE else None
     body_from_cam, camera = take_pose(reader), take_camera(reader)
     image_bytes = take_image(reader)
+    seen = take_seen(reader) if has & _HAS_SEEN else None
     try:
         return FrameAnswer(
             drone_id,
@@ -170,6 +182,7 @@ def take_frame_body(reader: Reader) -> FrameAnswer:
             image_bytes,
             world_from_body,
             not has & _HAS_NO_HEADING,
+            seen,
         )
     except ValueError as error:
         raise WireError(f"frame answer: {error}") from None

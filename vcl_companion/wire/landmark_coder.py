@@ -25,6 +25,7 @@ from vcl_companion.wire.landmark_kernels import (
     code_known,
     code_listed,
     code_new,
+    code_seen,
     end,
 )
 
@@ -114,6 +115,10 @@ class Stream:
     def code_listed(self, listed: Integers) -> None:
         """Code (n,) flags."""
         code_listed(self._coder, self._buffer, self._models, listed)
+
+    def code_seen(self, aside: Integers) -> None:
+        """Code (n, 2) where landmarks are seen, less what is expected."""
+        code_seen(self._coder, self._buffer, self._models, aside)
 
     def code_known(self, rows: Rows, there: Integers) -> None:
         """Code landmarks that both sides know from an earlier map.

@@ -239,6 +239,15 @@ def _code_pixel(c: Integers, buffer: Bytes, models: Integers, base: int, pixel: 
 
 
 @compiled
+def code_seen(c: Integers, buffer: Bytes, models: Integers, aside: Integers) -> None:
+    """Code where landmarks of a map are seen; see ``Stream``."""
+    for j in range(len(aside)):
+        if c[FAILED]:
+            return
+        _code_pixel(c, buffer, models, _RESIDUAL, aside[j])
+
+
+@compiled
 def code_known(
     c: Integers, buffer: Bytes, models: Integers, there: Integers, state: Integers,
     away: Integers, place: Integers, aside: Integers, depth: Integers, residual: Integers,

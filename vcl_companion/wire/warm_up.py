@@ -14,6 +14,7 @@ def warm_up() -> None:
     zero, none = np.zeros(1, dtype=np.int64), np.zeros((0, 1), dtype=np.int64)
     stream = Stream.writing(64)
     stream.code_listed(zero)
+    stream.code_seen(np.zeros((1, 2), dtype=np.int64))
     stream.code_known(Rows.blank(0, 1), none)
     stream.code_new(Rows.blank(0, 1), zero, np.zeros((1, 1), dtype=np.int64), zero)
     stream.written()
