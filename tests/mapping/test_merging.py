@@ -18,7 +18,11 @@ from vcl_companion.geometry.rotation import exp_so3, matrix_from_euler
 from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.mapping.agreement import contradiction
 from vcl_companion.mapping.aligning import Aligned, Side, aligned
-from vcl_companion.mapping.common_landmarks import Common, common_landmarks
+from vcl_companion.mapping.common_landmarks import (
+    Common,
+    common_landmarks,
+    common_where_expected,
+)
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.extension import ImageFeatures
 from vcl_companion.mapping.known_features import KeyframeLibrary, of_keyframes
@@ -223,6 +227,41 @@ def test_branches_of_one_map_are_merged_by_what_both_had() -> None:
     (joined,) = found.joined
     assert joined.world == parent
     assert np.abs(Similarity.identity().difference(joined.world_from_other)).max() < 0.05
+
+
+def test_in_one_world_only_those_are_compared_that_show_the_same() -> None:
+    """What they find is what all would; who looks elsewhere is not even looked at."""
+    given = two(2)
+    there, junior = given.senior_from_junior, given.junior
+    here = replace(
+        junior,
+        keyframes=tuple(
+            replace(k, world_from_body=there.of_pose(k.world_from_body)) for k in junior.keyframes
+        ),
+        points_world=there.apply(junior.points_world),
+    )
+    first = given.senior.keyframes[0]
+    away = replace(first, world_from_body=at(-1.0, 60.0), captured_at_ns=9, image_bytes=b"away")
+    blind = np.full((len(given.senior.points_world), 1, 2), np.nan)
+    senior = replace(
+        given.senior,
+        keyframes=(*given.senior.keyframes, away),
+        observed_px=np.concatenate([given.senior.observed_px, blind], axis=1),
+    )
+    looked_at: list[bytes] = []
+
+    def features_of(image_bytes: bytes, camera: Camera, detector: Detector) -> Features:
+        looked_at.append(image_bytes)
+        return features_in(given.views)(image_bytes, camera, detector)
+
+    found_by = of_keyframes(features_of, OPTIONS.detectors)
+    one, other = KeyframeLibrary(senior, found_by), KeyframeLibrary(here, found_by)
+    few, everything = common_where_expected(senior, here, one, other), given.common()
+    assert looked_at
+    assert b"away" not in looked_at
+    told = set(zip(everything.senior, everything.junior, strict=True))
+    assert set(zip(few.senior, few.junior, strict=True)) <= told
+    assert len(few.senior) > 0.7 * len(everything.senior) > 100
 
 
 def test_maps_of_different_places_are_not_merged() -> None:

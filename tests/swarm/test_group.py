@@ -173,6 +173,20 @@ def test_who_is_not_believed_is_there_but_counts_for_nothing() -> None:
     assert group.lacking() == (3, 4)
 
 
+def test_our_map_goes_on_without_those_whose_own_is_about_to_be_merged_into_it() -> None:
+    group = Group(THREE, 1)
+    group.set_own_state(MapState(NEW.revision, 1000, True, wants_update=True))
+    for peer in (2, 3):
+        group.map_state(peer, OLD, 0.0)
+    assert (group.lacking(), group.majority_wants_update) == ((2, 3), False)
+    group.leave_apart(frozenset({1, 2, 3}))  # never ourselves
+    assert (group.lacking(), group.majority_wants_update) == ((), True)
+    assert group.contributors((2,), 3) == (1,)
+    assert group.trusted_teammates == (1, 2, 3)
+    group.leave_apart(frozenset())
+    assert (group.lacking(), group.majority_wants_update) == ((2, 3), False)
+
+
 def test_others_outvote_us_when_most_of_them_and_two_at_least_hold_a_map() -> None:
     group = Group(SwarmOptions((1, 2, 3, 4)), 1)
     group.map_state(2, NEW, 0.0)

@@ -172,6 +172,7 @@ class Exchange:
             self._passed,
             transfers.frames_carried_in_s,
             lambda: transfers.is_receiving(BlobKind.MAP, self._now_s()),
+            lambda: self._sharing.is_merging,
             log,
             clock,
             self.clocks,

@@ -18,8 +18,9 @@ from vcl_companion.mapping.landmark_map import JoinedMap, LandmarkMap
 from vcl_companion.swarm.group import Group
 from vcl_companion.wire.header import BlobKind
 
-# A coordinator whose map we do not know is about to send it, as a rule.
-_SENDS_S = 5.0
+# A coordinator whose map we do not know is about to send it, as a rule, if it had ours before. If
+# it had not, it knows nothing of what ours has in it: there is time to hear what it says next.
+_SENDS_S, _SAYS_S = 5.0, 1.0
 _MAX_REFUSED = 64
 
 
@@ -42,6 +43,7 @@ class MapBranches:
         self._wait_s = wait_s
         self._given_by = group.own_id
         self._refused: deque[bytes] = deque(maxlen=_MAX_REFUSED)
+        self._had_ours: tuple[bytes, set[int]] = (b"", set())
         self._merged: set[int] = set()  # other teams' coordinators, whose map is in ours
         self._foreign_since_s: dict[int, tuple[bytes, float]] = {}
 
@@ -79,16 +81,24 @@ class MapBranches:
             seniors = [team for team in group.teams_met if group.is_senior(team)]
             return group.coordinator_of(seniors[0]) if seniors else None
         coordinator = group.coordinator
+        self._note_holders(current.revision)
         state = group.state_of(coordinator)
         is_line_of_another = self._given_by != coordinator
         if state is None or not (is_line_of_another and self._is_foreign(state.revision)):
             self._foreign_since_s.pop(coordinator, None)
             return None
         _, since_s = self._foreign_since_s.setdefault(coordinator, (state.revision, now_s))
-        if now_s < since_s + _SENDS_S or self._is_receiving():
+        wait_s = _SENDS_S if coordinator in self._had_ours[1] else _SAYS_S
+        if now_s < since_s + wait_s or self._is_receiving():
             return None
         is_first_holder = group.holders(current.revision)[:1] == (group.own_id,)
         return coordinator if is_first_holder else None
+
+    def _note_holders(self, revision: bytes) -> None:
+        """Remember who has had our map, as long as it is in use here."""
+        if self._had_ours[0] != revision:
+            self._had_ours = revision, set()
+        self._had_ours[1].update(self._group.holders(revision))
 
     def joining(self) -> tuple[int, ...]:
         """Return the other teams' coordinators whose map ours has in it, to be handed ours."""

@@ -127,8 +127,15 @@ class MapHanding:
             self._behind_since_s = None
         elif self._behind_since_s is None:
             self._behind_since_s = now_s
-        for peer in self._lacking(stored.revision):
-            if self._group.is_coordinator and self._branches.is_awaited(peer, now_s):
+        lacking = self._lacking(stored.revision)
+        apart = {
+            peer
+            for peer in lacking
+            if self._group.is_coordinator and self._branches.is_awaited(peer, now_s)
+        }
+        self._group.leave_apart(frozenset(apart))
+        for peer in lacking:
+            if peer in apart:
                 continue
             if self._group.state_of(peer) is None:
                 continue  # it is about to say what it has, perhaps a map of a world of its own

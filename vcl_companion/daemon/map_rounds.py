@@ -82,6 +82,8 @@ class MapRounds:
         passed: sends the frames of an update on while it is built.
         carried_in_s: how long so many frames take on the link.
         is_receiving_map: whether a peer's map has been coming in lately.
+        is_merging: whether one is being merged into ours: an update would have to wait for that,
+            and one of the two would be in vain.
         log: told of every update that is begun.
         clock: time base of frames.
         clocks: whose instants are when.
@@ -102,6 +104,7 @@ class MapRounds:
         passed: PassedFrames,
         carried_in_s: Callable[[int], float],
         is_receiving_map: Callable[[], bool],
+        is_merging: Callable[[], bool],
         log: FlightLog,
         clock: Clock,
         clocks: PeerClocks,
@@ -119,6 +122,7 @@ class MapRounds:
         self._is_updating = False
         self._carried_in_s = carried_in_s
         self._is_receiving_map = is_receiving_map
+        self._is_merging = is_merging
         self._log = log
         self._clock = clock
         self._work = work
@@ -162,6 +166,8 @@ class MapRounds:
                 await asyncio.sleep(_LOOK_S)
 
     def _is_due(self) -> bool:
+        if self._is_merging():
+            return False
         asked = self.is_asked and self._group.is_coordinator and not self._group.lacking()
         return asked or self._trigger.is_due(self._now_s())
 

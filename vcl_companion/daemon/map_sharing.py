@@ -65,6 +65,7 @@ class MapSharing:
 
     Attributes:
         handing: whom ours is handed to.
+        is_merging: whether another map is being merged into ours.
     """
 
     def __init__(
@@ -99,6 +100,7 @@ class MapSharing:
         self._carry = carry
         self._branches = MapBranches(group, maps, self._is_receiving, delivery_wait_s)
         self._offered: PeerMailbox[MapOffer] = PeerMailbox()
+        self.is_merging = False
         self.handing = MapHanding(group, transfers, maps, work, passed, self._branches)
 
     def offer(self, peer: int, kind: BlobKind, blob: bytes) -> None:
@@ -160,6 +162,13 @@ class MapSharing:
 
     async def _merge(self, peer: int, offer: MapOffer) -> bool:
         """Make our next revision of ours and a peer's that went apart; whether that was done."""
+        self.is_merging = True
+        try:
+            return await self._merge_into_current(peer, offer)
+        finally:
+            self.is_merging = False
+
+    async def _merge_into_current(self, peer: int, offer: MapOffer) -> bool:
         self._log.event("merge", f"map {offer.revision.hex()} of drone {peer} into ours")
         made: LandmarkMap | NoMap = NoMap("ours changed meanwhile, again and again")
         for _ in range(_MERGE_ATTEMPTS):

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.known_features import Index, KeyframeLibrary
-from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.vision.features import Features
 from vcl_companion.vision.matching import MatchOptions, match_mutual
 
@@ -21,6 +22,9 @@ from vcl_companion.vision.matching import MatchOptions, match_mutual
 _SAME_PX = 0.5
 # Of larger maps the newest keyframes are compared: every one with every one is quadratic.
 _MOST_KEYFRAMES = 24
+# Where it is known what shows the same, each is compared with so many that show most of it, and
+# at least so much.
+_EXPECTED, _LEAST_SHARE = 3, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +55,39 @@ def shared_keyframes(senior: LandmarkMap, junior: LandmarkMap) -> list[tuple[int
 
     where = {name: i for i, name in enumerate(names(senior))}
     return [(where[name], i) for i, name in enumerate(names(junior)) if name in where]
+
+
+def common_where_expected(
+    senior: LandmarkMap,
+    junior: LandmarkMap,
+    of_senior: KeyframeLibrary,
+    of_junior: KeyframeLibrary,
+) -> Common:
+    """Find what ``common_landmarks`` does for two maps of one world, by few pairs of keyframes.
+
+    Their poses say which of them show the same, however far apart the two have drifted, as long
+    as that is less than what an image shows.
+    """
+    shared = shared_keyframes(senior, junior)
+    certain = [_at_same_pixels(senior, junior, k, i) for k, i in shared]
+    alike = []
+    for i in range(len(junior.keyframes))[-_MOST_KEYFRAMES:]:
+        if any(i == of_both for _, of_both in shared):
+            continue
+        points = junior.points_world[junior.seen[:, i]]
+        shares = np.array([_share_in_view(k, points) for k in senior.keyframes])
+        for k in np.argsort(-shares, kind="stable")[:_EXPECTED]:
+            if shares[k] >= _LEAST_SHARE:
+                own, theirs = _landmarks_shown(of_senior, int(k)), _landmarks_shown(of_junior, i)
+                alike.append(_alike(own, theirs))
+    return _gathered(certain, alike)
+
+
+def _share_in_view(keyframe: Keyframe, points: Array) -> float:
+    """Return which share of (M, 3) points, world, a keyframe's camera sees; 0 of none."""
+    cam_from_world = (keyframe.world_from_body @ keyframe.body_from_cam).inverse()
+    inside = keyframe.camera.shows(keyframe.camera.project(cam_from_world.apply(points)), 0.0)
+    return float(inside.mean()) if len(inside) else 0.0
 
 
 def common_landmarks(

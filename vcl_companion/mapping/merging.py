@@ -14,8 +14,12 @@ import numpy as np
 
 from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.mapping.agreement import contradiction
-from vcl_companion.mapping.aligning import Aligned, Side, aligned
-from vcl_companion.mapping.common_landmarks import common_landmarks, shared_keyframes
+from vcl_companion.mapping.aligning import MIN_COMMON, Aligned, Side, aligned
+from vcl_companion.mapping.common_landmarks import (
+    common_landmarks,
+    common_where_expected,
+    shared_keyframes,
+)
 from vcl_companion.mapping.continuity import broken_continuity, pruned
 from vcl_companion.mapping.culling import Mask, decisive, fitting
 from vcl_companion.mapping.extension import ImageFeatures
@@ -30,7 +34,10 @@ from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
 from vcl_companion.mapping.union import Union, united
 from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust
+from vcl_companion.vision.features import Detector
 
+# So many landmarks of both tell how two maps of one world stand, whatever else there is.
+_PLENTY = 5 * MIN_COMMON
 # The table of all landmarks in all keyframes is as large as peers take one at most.
 _MAX_CELLS = 1 << 20
 # Residuals, in units of the last limit, and steps: a map may be bent before it is adjusted.
@@ -78,12 +85,7 @@ def merged(
     one_world = senior.world_of(senior_revision) == junior.world_of(junior_revision)
     try:
         one, other = Side(senior, sure or map_uncertainty(senior)), _side(junior)
-        of_one, of_other = (
-            KeyframeLibrary(m, of_keyframes(features_of, options.detectors))
-            for m in (senior, junior)
-        )
-        common = common_landmarks(senior, junior, of_one, of_other)
-        stands = aligned(one, other, common, options, seed, one_world=one_world)
+        stands = _aligned(one, other, features_of, options, seed, one_world=one_world)
         if isinstance(stands, NoMap):
             return stands
         both = united(one, other, stands, pyramid_of, options, one_world=one_world)
@@ -99,6 +101,34 @@ def merged(
         return _checked(replace(grown, landmark_map=named), one, options)
     except ValueError as error:
         return NoMap(str(error))
+
+
+def _aligned(
+    one: Side,
+    other: Side,
+    features_of: ImageFeatures,
+    options: MapOptions,
+    seed: int,
+    *,
+    one_world: bool,
+) -> Aligned | NoMap:
+    """Find how the junior map stands to the senior: in one world where it says, if that suffices.
+
+    All keyframes with all, by all detectors, takes five times as long, and nobody's map is
+    extended meanwhile.
+    """
+
+    def libraries(detectors: tuple[Detector, ...]) -> tuple[KeyframeLibrary, KeyframeLibrary]:
+        found = of_keyframes(features_of, detectors)
+        return KeyframeLibrary(one.map, found), KeyframeLibrary(other.map, found)
+
+    if one_world:
+        few = common_where_expected(one.map, other.map, *libraries(options.detectors[:1]))
+        stands = aligned(one, other, few, options, seed, one_world=True)
+        if isinstance(stands, Aligned) and len(stands.common.senior) >= _PLENTY:
+            return stands
+    common = common_landmarks(one.map, other.map, *libraries(options.detectors))
+    return aligned(one, other, common, options, seed, one_world=one_world)
 
 
 def _needless(

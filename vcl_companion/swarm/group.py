@@ -72,6 +72,7 @@ class Group:
         self._ever_heard: set[int] = set()
         self._states: dict[int, MapState] = {}  # ours, and of members alive
         self._distrusted: frozenset[int] = frozenset()
+        self._apart: frozenset[int] = frozenset()
         self._team = 0
         self._epochs = Epochs(own_id)
         self._graph = OverlapGraph(self.members, OverlapOptions())
@@ -101,6 +102,14 @@ class Group:
         """Note who is not believed from now on; all others are."""
         self._distrusted = peers - {self.own_id}
         self._take_term()
+
+    def leave_apart(self, peers: frozenset[int]) -> None:
+        """Note who flies on a map of its own that is about to be merged into ours.
+
+        Until then ours goes on without them: they neither vote for what it is to become, nor
+        give frames to it, nor are waited for to have it.
+        """
+        self._apart = peers - {self.own_id}
 
     @property
     def is_complete(self) -> bool:
@@ -267,7 +276,7 @@ class Group:
             state = self._states.get(member)
             return state.tracked if state is not None else 0
 
-        trusted = self.trusted_teammates
+        trusted = self._electorate
         others = sorted(trusted, key=lambda member: (seen(member), member))
         order = dict.fromkeys((self.own_id, *first, *others))
         return tuple(m for m in order if m in trusted)[:most]
@@ -291,7 +300,7 @@ class Group:
         if not self.newest_revision:
             return ()
         holders = self.holders(self.newest_revision)
-        return tuple(member for member in self.trusted_teammates if member not in holders)
+        return tuple(member for member in self._electorate if member not in holders)
 
     @property
     def wanting_update(self) -> tuple[int, ...]:
@@ -303,13 +312,17 @@ class Group:
         if not self.newest_revision:
             return ()
         holders = self.holders(self.newest_revision)
-        trusted = self.trusted_teammates
-        return tuple(m for m in trusted if m in holders and self._states[m].wants_update)
+        return tuple(m for m in self._electorate if m in holders and self._states[m].wants_update)
 
     @property
     def majority_wants_update(self) -> bool:
         """Whether more than half of the teammates trusted vote for an update."""
-        return 2 * len(self.wanting_update) > len(self.trusted_teammates)
+        return 2 * len(self.wanting_update) > len(self._electorate)
+
+    @property
+    def _electorate(self) -> tuple[int, ...]:
+        """Those who decide on our map, and make it: teammates believed, and not on their own."""
+        return tuple(m for m in self.trusted_teammates if m not in self._apart)
 
     def most_others_hold(self, revision: bytes) -> bool:
         """Whether most of the other teammates trusted, and at least two, hold a revision."""

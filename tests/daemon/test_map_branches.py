@@ -1,0 +1,64 @@
+"""Who is handed whose map when the parts of a swarm hear each other again, and how soon."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.daemon import demo
+from vcl_companion.daemon.map_branches import MapBranches
+from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.swarm.group import Group, SwarmOptions
+from vcl_companion.wire.map_codec import revision_of
+from vcl_companion.wire.messages import MapState
+
+OURS = revision_of(demo.encoded_map(1, 2))
+THEIRS = MapState(b"another!", 900, True)
+
+
+class Member:
+    """Drone 2 of three, which has made a map while the leader, drone 1, was away."""
+
+    def __init__(self) -> None:
+        self.group = Group(SwarmOptions((1, 2, 3)), 2)
+        self.maps = MapStore("")
+        self.maps.replace(demo.encoded_map(1, 2), demo.map_index(1, 2))
+        self.is_receiving = False
+        self.branches = MapBranches(self.group, self.maps, lambda: self.is_receiving, 20.0)
+        self.group.set_own_state(MapState(OURS, 900, True))
+        self.group.map_state(3, MapState(OURS, 900, True), 0.0)
+
+    def handed_at_s(self, until_s: float = 9.0) -> float | None:
+        """When the coordinator is handed our map; None: not by then."""
+        times = (n / 10 for n in range(round(10 * until_s)))
+        return next((t for t in times if self.branches.receiver(t) is not None), None)
+
+
+def test_a_coordinator_that_never_had_our_map_gets_it_within_a_second() -> None:
+    member = Member()
+    member.group.map_state(1, THEIRS, 0.0)
+    assert member.handed_at_s() == pytest.approx(1.0)
+
+
+def test_one_that_had_it_is_about_to_send_what_it_has_made_of_it() -> None:
+    member = Member()
+    member.group.map_state(1, MapState(OURS, 900, True), 0.0)
+    assert member.handed_at_s(0.5) is None
+    member.group.map_state(1, THEIRS, 0.6)
+    assert member.handed_at_s() == pytest.approx(5.0)
+
+
+def test_while_a_map_comes_in_none_is_handed() -> None:
+    member = Member()
+    member.group.map_state(1, THEIRS, 0.0)
+    member.is_receiving = True
+    assert member.handed_at_s() is None
+
+
+def test_the_first_of_those_who_have_it_hands_it() -> None:
+    third = Member()
+    third.group = Group(SwarmOptions((1, 2, 3)), 3)
+    third.branches = MapBranches(third.group, third.maps, lambda: False, 20.0)
+    third.group.set_own_state(MapState(OURS, 900, True))
+    third.group.map_state(2, MapState(OURS, 900, True), 0.0)
+    third.group.map_state(1, THEIRS, 0.0)
+    assert third.handed_at_s() is None
