@@ -2,17 +2,39 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from tests.daemon import demo
+from tests.daemon.swarm import FAST, INTER
+from tests.daemon.waiting import run
 from vcl_companion.daemon.map_branches import MapBranches
+from vcl_companion.daemon.map_handing import MapHanding
 from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.swarm.group import Group, SwarmOptions
+from vcl_companion.swarm.transfer import BlobKind, Transfers
 from vcl_companion.wire.map_codec import revision_of
 from vcl_companion.wire.messages import MapState
 
 OURS = revision_of(demo.encoded_map(1, 2))
 THEIRS = MapState(b"another!", 900, True)
+
+
+def handing(group: Group, maps: MapStore, transfers: Transfers) -> MapHanding:
+    """What hands our map to whom, with all that it asks."""
+    work = MapWork(demo.workshop(SwarmOptions((1, 2, 3)), demo.sensor(1), INTER), forks=False)
+    passed = PassedFrames(
+        group,
+        lambda peer, blob: transfers.submit(peer, BlobKind.PASSED_FRAME, blob, 0.0),
+        transfers.cancel,
+        work,
+        lambda: False,
+    )
+    return MapHanding(
+        group, transfers, maps, work, passed, MapBranches(group, maps, lambda: False, 20.0)
+    )
 
 
 class Member:
@@ -62,3 +84,35 @@ def test_the_first_of_those_who_have_it_hands_it() -> None:
     third.group.map_state(2, MapState(OURS, 900, True), 0.0)
     third.group.map_state(1, THEIRS, 0.0)
     assert third.handed_at_s() is None
+
+
+def test_a_map_that_was_replaced_does_not_reach_who_was_away_when_it_is_back() -> None:
+    async def scenario() -> None:
+        group, maps = Group(SwarmOptions((1, 2, 3)), 1), MapStore("")
+        transfers = Transfers(FAST, np.random.default_rng(0))
+        hands = handing(group, maps, transfers)
+        maps.replace(demo.encoded_map(1, 2), demo.map_index(1, 2))
+        group.set_own_state(MapState(OURS, 900, True))
+        for peer in (2, 3):
+            group.map_state(peer, MapState(b"", 0, False), 0.0)
+        hands.hand_out(0.0)
+        begun, _ = transfers.poll(0.0)
+        assert {payload.peer for payload in begun} <= {0, 2, 3}
+        assert begun
+        group.poll(20.0)  # both are lost
+        assert group.alive == (1,)
+        maps.replace(demo.encoded_map(1, 2, 3), demo.map_index(1, 2, 3))
+        hands.hand_out(20.0)
+        assert transfers.poll(60.0) == ([], [])
+
+    run(scenario())
+
+
+def test_what_the_drone_that_gave_us_our_map_makes_of_it_is_taken_meanwhile() -> None:
+    member = Member()
+    member.branches.given_by(3)
+    member.group.map_state(1, THEIRS, 0.0)
+    assert member.branches.goes_on_by(3)
+    assert not member.branches.goes_on_by(1)
+    member.group.map_state(1, MapState(OURS, 900, True), 0.0)
+    assert not member.branches.goes_on_by(3)

@@ -210,6 +210,7 @@ class Sky:
     round_s: float = 2.0
     helps: bool = True
     delivers: bool = True
+    moves: bool = False
     now_s: float = 0.0
     members: dict[int, Member] = field(default_factory=dict)
     begun: list[tuple[float, int]] = field(default_factory=list)
@@ -266,7 +267,7 @@ class Sky:
 
     def _finish(self, member: Member) -> None:
         member.round_ends_at_s = None
-        member.trigger.ended(self.now_s)
+        member.trigger.ended(self.now_s, from_new_places=self.moves)
         self.n_made += 1
         member.revision = b"rev %4d" % self.n_made
         for other in self.members.values():
@@ -447,6 +448,26 @@ def test_rounds_that_do_not_help_become_rare_until_one_helps() -> None:
     sky.run(16.0)
     pauses = np.diff([at_s for at_s, _ in sky.begun[n_before:]]) - sky.round_s
     assert pauses[0] == pytest.approx(interval_s, abs=4 * STEP_S)
+
+
+def test_who_is_on_the_move_goes_on_however_little_each_round_brings() -> None:
+    sky = Sky((1, 2, 3), helps=False, moves=True)
+    sky.see(FEW, 1, 2, 3)
+    sky.run(60.0)
+    pauses = np.diff([at_s for at_s, _ in sky.begun]) - sky.round_s
+    assert len(pauses) >= 10
+    assert (pauses < 2.0 * OPTIONS.interval_s).all()
+
+
+def test_who_falls_silent_is_not_waited_for_until_it_is_lost() -> None:
+    sky = Sky((1, 2, 3))
+    sky.run(10.0)
+    sky.die(2)
+    sky.die(3)
+    sky.see(FEW, 1)
+    sky.run(4.0, lambda: bool(sky.begun))
+    assert sky.begun
+    assert sky.members[1].group.alive == (1, 2, 3)
 
 
 def test_rounds_that_show_more_for_a_moment_only_stay_frequent() -> None:

@@ -51,6 +51,14 @@ class MapBranches:
         """Note who has given us the map in use, ourselves perhaps."""
         self._given_by = peer
 
+    def goes_on_by(self, peer: int) -> bool:
+        """Whether our map is a peer's, and the coordinator's is another that it will go into.
+
+        Until then what the peer makes of it is taken, or its part of the swarm would fly on two.
+        """
+        state = self._group.state_of(self._group.coordinator)
+        return self._given_by == peer and state is not None and self._is_foreign(state.revision)
+
     def refused(self, revision: bytes) -> None:
         """Note a map that cannot be merged with ours."""
         self._refused.append(revision)

@@ -123,6 +123,7 @@ class MapHanding:
             stored = _hand_out_of(current)
         if stored is None or (current is not None and current.part_of):
             return
+        self._abandon_all_but(stored.revision)
         if not self._coordinator_is_behind():
             self._behind_since_s = None
         elif self._behind_since_s is None:
@@ -146,13 +147,21 @@ class MapHanding:
         for peer in (*self._branches.joining(), *(() if merges is None else (merges,))):
             self._hand(peer, stored, now_s, _whole)
 
+    def _abandon_all_but(self, revision: bytes) -> None:
+        """Stop sending maps that a newer one has replaced, to who is away at the moment as well.
+
+        What comes through when it is back would be taken for the newest that there is.
+        """
+        for peer, last in list(self._handed.items()):
+            if last.revision != revision:
+                self._transfers.cancel(last.transfer_id)
+                del self._handed[peer]
+
     def _hand(self, peer: int, stored: HandOut, now_s: float, form_for: FormFor) -> None:
         """Send a map to a peer, unless it is on its way or was sent in vain lately."""
         last = self._handed.get(peer)
         n_delivered = 0
-        if last is not None and last.revision != stored.revision:
-            self._transfers.cancel(last.transfer_id)
-        elif last is not None:
+        if last is not None:
             if now_s < last.again_at_s:
                 return
             n_delivered = last.n_delivered

@@ -120,6 +120,7 @@ class MapRounds:
         self._decide = decide
         self._passed = passed
         self._is_updating = False
+        self._is_from_new_places = False
         self._carried_in_s = carried_in_s
         self._is_receiving_map = is_receiving_map
         self._is_merging = is_merging
@@ -161,7 +162,7 @@ class MapRounds:
                     await self._next_revision(stored, frame)
                 finally:
                     self.progress, self.is_asked = 255, False
-                self._trigger.ended(self._now_s())
+                self._trigger.ended(self._now_s(), from_new_places=self._is_from_new_places)
             else:
                 await asyncio.sleep(_LOOK_S)
 
@@ -230,6 +231,7 @@ class MapRounds:
         self._log.event("update", reason)
         _log.info("the map is updated, %s", reason)
 
+        self._is_from_new_places = False
         request_id = self._gathering.begin()
         contributors = await self._contributors(stored, frame, lost)
         earlier = dict.fromkeys(lost, update.joiner_frames - 1)
@@ -294,7 +296,12 @@ class MapRounds:
                 await self._decide(built, stored, request_id)
                 shown = {(k.drone_id, k.captured_at_ns) for k in built.keyframes}
                 left_out = [f for f in frames if (f.drone_id, f.captured_at_ns) not in shown]
-                frames = [f for f in left_out if f.drone_id in lost or _is_far(f, stored)]
+                self._is_from_new_places = any(
+                    _is_newer(f, stored, self._options.update.novelty_deg)
+                    for f in frames
+                    if f not in left_out
+                )
+                frames = [f for f in left_out if f.drone_id in lost or _is_newer(f, stored)]
                 current = self._maps.current
                 if not frames or current is None:
                     return
@@ -377,13 +384,13 @@ class MapRounds:
         return asyncio.get_running_loop().time()
 
 
-def _is_far(frame: FrameAnswer, stored: StoredMap) -> bool:
-    """Whether a frame shows a map so differently that only features may join it, if at all."""
+def _is_newer(frame: FrameAnswer, stored: StoredMap, than_deg: float = NEAR_DEG) -> bool:
+    """Whether a frame shows a map so differently; ``NEAR_DEG``: that only features may join it."""
     if frame.world_from_body is None:
         return True
     world_from_cam = frame.world_from_body @ frame.body_from_cam
     novelty_deg = novelty_from(stored.index.landmark_map, world_from_cam, frame.camera)
-    return novelty_deg is None or novelty_deg > NEAR_DEG
+    return novelty_deg is None or novelty_deg > than_deg
 
 
 def _listed(drones: tuple[int, ...]) -> str:

@@ -327,6 +327,8 @@ class MapSharing:
         if self._branches.comes_from_senior(peer):
             return None
         if peer != group.coordinator:
+            if offer.parent == current.revision and self._branches.goes_on_by(peer):
+                return None
             return "map, but not from the coordinator"
         if not group.may_lead(peer):
             return "map of a coordinator that was away"

@@ -30,6 +30,8 @@ __all__ = ["Group", "GroupEvent", "PeerJoined", "PeerLost", "SwarmOptions"]
 
 # A signature is told no more often: 48 bytes more each time.
 _SIGNATURE_INTERVAL_S = 2.9
+# Who has said nothing for this share of the time-out is not waited for any more.
+_SILENT = 0.5
 _SAID_NOTHING = MapState(b"", 0, False)
 
 
@@ -321,8 +323,15 @@ class Group:
 
     @property
     def _electorate(self) -> tuple[int, ...]:
-        """Those who decide on our map, and make it: teammates believed, and not on their own."""
-        return tuple(m for m in self.trusted_teammates if m not in self._apart)
+        """Those who decide on our map, and make it: teammates believed, heard, not on their own."""
+        return tuple(
+            m for m in self.trusted_teammates if m not in self._apart and not self._is_silent(m)
+        )
+
+    def _is_silent(self, member: int) -> bool:
+        """Whether a member may be lost, which is known later: nobody else waits for its word."""
+        heard_at_s = self._heard_at_s.get(member)
+        return heard_at_s is not None and self._now_s >= heard_at_s + _SILENT * self._timeout_s
 
     def most_others_hold(self, revision: bytes) -> bool:
         """Whether most of the other teammates trusted, and at least two, hold a revision."""

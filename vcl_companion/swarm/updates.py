@@ -396,9 +396,15 @@ class UpdateTrigger:
         lost_s = self._options.lost_s
         return tuple(m for m, since_s in self._lost_since_s.items() if now_s >= since_s + lost_s)
 
-    def ended(self, now_s: float) -> None:
-        """Note the end of a round, whatever came of it; pauses grow until one has helped."""
-        self._n_in_vain += 1
+    def ended(self, now_s: float, *, from_new_places: bool) -> None:
+        """Note the end of a round, whatever came of it; pauses grow until one has helped.
+
+        Args:
+            now_s: not before the last call's.
+            from_new_places: whether the map was extended by views that were new to it: whoever
+                is on the move needs the next one as much, however little each brings.
+        """
+        self._n_in_vain = 0 if from_new_places else self._n_in_vain + 1
         self._ended_at_s = now_s
         self._wanted_since_s = None
 
