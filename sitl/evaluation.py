@@ -14,7 +14,7 @@ roll pitch yaw; so errors are carried back into ``world`` first.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,15 +35,23 @@ class Estimates:
         world_from_body: T poses.
         covariances: (T, 6, 6) as sent: x y z in world axes, m, then roll pitch
             yaw, rad; NaN where none was sent.
+        reset_counters: (T,) int64 as sent; zeros where not given.
     """
 
     at_ns: NDArray[np.int64]
     world_from_body: tuple[Pose, ...]
     covariances: Array
+    reset_counters: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
         n = len(self.world_from_body)
-        for name, shape, kind in (("at_ns", (n,), np.int64), ("covariances", (n, 6, 6), float)):
+        if len(self.reset_counters) == 0:
+            object.__setattr__(self, "reset_counters", np.zeros(n, dtype=np.int64))
+        for name, shape, kind in (
+            ("at_ns", (n,), np.int64),
+            ("covariances", (n, 6, 6), float),
+            ("reset_counters", (n,), np.int64),
+        ):
             value = np.array(getattr(self, name), dtype=kind)
             if value.shape != shape:
                 raise ValueError(f"Estimates.{name} has shape {value.shape}, expected {shape}")

@@ -237,7 +237,7 @@ def read_received(path: Path, system_id: int) -> Estimates:
     Raises:
         FlightError: a line is not what it should be; names file and row.
     """
-    at_ns, poses, covariances = [], [], []
+    at_ns, poses, covariances, resets = [], [], [], []
     for row, line in _json_lines(path):
         if (
             line.get("type") != "VISION_POSITION_ESTIMATE"
@@ -253,8 +253,12 @@ def read_received(path: Path, system_id: int) -> Estimates:
         except ValueError as error:
             raise FlightError(f"{path}, row {row}: {error}") from error
         at_ns.append(said.usec * 1000)
+        resets.append(said.reset_counter)
     return Estimates(
-        np.array(at_ns, dtype=np.int64), tuple(poses), np.array(covariances).reshape(-1, 6, 6)
+        np.array(at_ns, dtype=np.int64),
+        tuple(poses),
+        np.array(covariances).reshape(-1, 6, 6),
+        np.array(resets, dtype=np.int64),
     )
 
 

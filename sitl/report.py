@@ -29,6 +29,7 @@ Terms beyond ``sitl.evaluation``'s:
   and to the first pose that it sent; null for who is there from the start, when the recording
   waits for the map. Who was killed is judged by the frames that its daemon was given while it
   lived, and answered; ``peer_bytes_sent`` and the load are the last run's.
+* ``phases``: before, during and after each partition (``sitl.phases``).
 * ``peer_bytes_per_s``: sent to the other drones, per second of recording time.
 * ``peer_link``: the same by message, and what became of it (``sitl.network_report``).
 * ``map``: the leader's last ``revision``; ``revisions`` counts all of them.
@@ -47,6 +48,7 @@ import numpy as np
 
 from sitl.lives_report import lives_of
 from sitl.network_report import options_of, peer_link_of
+from sitl.phases import phases_of
 from sitl.plan import FlyOptions, pipeline_of
 from sitl.reliance import shares
 from sitl.report_page import page
@@ -110,6 +112,7 @@ def report_of(result: FlightResult) -> dict[str, Any]:
             drone.name: {
                 **_drone(drone, duration_s),
                 "lives": lives_of(result, drone),
+                "phases": phases_of(result, drone),
                 "peer_link": peer_link_of(result.network, drone.name, duration_s),
             }
             for drone in result.drones

@@ -12,6 +12,7 @@ from sitl.fused import FUSED_COLUMNS
 from sitl.lives_report import lives_html
 from sitl.network_report import network_html, network_text
 from sitl.page_style import document, drones_table, section
+from sitl.phases import phases_html
 from sitl.plotting import colour
 from sitl.reliance import RELIANCES, strips_svg
 from sitl.result import FlightResult
@@ -44,7 +45,7 @@ def page(result: FlightResult, report: Mapping[str, Any]) -> str:
     """Return the whole page of a flight; ``report`` is what ``report.json`` says."""
     name = escape(str(report["recording"]))
     errors = report_plots.errors_svg(result)
-    network, lives = network_html(report), lives_html(report)
+    network, lives, phases = network_html(report), lives_html(report), phases_html(report)
     fused = drones_table(report, "fused", FUSED_COLUMNS)
     missions = drones_table(report, "mission", MISSION_COLUMNS)
     parts = [
@@ -57,6 +58,7 @@ def page(result: FlightResult, report: Mapping[str, Any]) -> str:
         section("Whence the poses", _SOURCE_NOTE, _source_table(report)),
         section("What the autopilots made of it", _FUSED_NOTE, fused) if fused else "",
         section("Lives of the daemons", _LIVES_NOTE, lives) if lives else "",
+        section("Apart and together", _PHASES_NOTE, phases) if phases else "",
         section("Error along every axis", _ERROR_NOTE, errors) if errors else "",
         section("Tracked landmarks", "", report_plots.landmarks_svg(result)),
         section("Latency and load", _LATENCY_NOTE,
@@ -91,6 +93,11 @@ _SOURCE_NOTE = (
     "Share of the frames whose pose came from the frame's own landmarks (intra), from a peer that "
     "saw the same (inter), or from both. NEES and ATE of each by itself, before it was fused, "
     "beside what was sent."
+)
+_PHASES_NOTE = (
+    "While some could not hear others, before that and after. Resets: announced to the autopilot "
+    "by reset_counter. Largest step: by how much the error of what it was told changed at most "
+    "from one frame to the next without such an announcement."
 )
 _ERROR_NOTE = (
     "Along the recording's axes; the band is three sigmas as sent, a red ring a pose outside it. "

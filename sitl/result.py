@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -94,7 +94,12 @@ class DroneResult:
     @property
     def n_localized(self) -> int:
         """Frames whose pose reached the autopilot, but for those that nobody had measured."""
-        return len(self._heard - self._coasted)
+        return len(self.localized)
+
+    @property
+    def localized(self) -> set[int]:
+        """Which frames these are."""
+        return self._heard - self._coasted
 
     @property
     def n_coasted(self) -> int:
@@ -282,7 +287,13 @@ def _apart(received: Estimates, propagated: Sequence[PropagatedRow]) -> tuple[Es
 def _chosen(estimates: Estimates, which: NDArray[np.bool_]) -> Estimates:
     kept = np.flatnonzero(which)
     poses = tuple(estimates.world_from_body[n] for n in kept)
-    return Estimates(estimates.at_ns[kept], poses, estimates.covariances[kept])
+    return replace(
+        estimates,
+        at_ns=estimates.at_ns[kept],
+        world_from_body=poses,
+        covariances=estimates.covariances[kept],
+        reset_counters=estimates.reset_counters[kept],
+    )
 
 
 def _between(
@@ -311,7 +322,7 @@ def _on_frames(planned: PlannedDrone, received: Estimates) -> tuple[Estimates, N
     nearest = np.where(closer, after, before)
     fits = np.abs(frames[nearest] - received.at_ns) <= _SAME_FRAME_NS
     at_ns = np.where(fits, frames[nearest], received.at_ns)
-    exact = Estimates(at_ns, received.world_from_body, received.covariances)
+    exact = replace(received, at_ns=at_ns)
     return exact, np.where(fits, nearest, -1)
 
 

@@ -21,6 +21,7 @@ from sitl.goals import Goal
 from sitl.lives_report import LIFE_COLUMNS, life_rows
 from sitl.network_report import DELAYS, NETWORK_COLUMNS, delay_text, message_rows
 from sitl.page_style import Column, cells
+from sitl.phases import PHASE_COLUMNS, phase_rows
 
 
 @contextmanager
@@ -90,6 +91,13 @@ def show_report(console: Console, report: Mapping[str, Any], out: Path) -> None:
         table = _numbers(("daemon", *heads))
         for name, values in lives:
             table.add_row(name, *(_number(value, 2) for value in values))
+        console.print(table)
+    phases = phase_rows(report)
+    if phases:
+        heads = (_broken(label) for _, label, _ in PHASE_COLUMNS)
+        table = _numbers(("phase", "drone", *heads))
+        for phase, name, texts in phases:
+            table.add_row(phase, name, *texts)
         console.print(table)
     _show_network(console, report)
     for event in report["events"]:

@@ -12,8 +12,10 @@ import msgspec
 import numpy as np
 
 from sitl.evaluation import upper_from_covariance
+from sitl.network import NetworkOptions
 from sitl.network_log import NetworkLog
 from sitl.out_folder import prepare_folder
+from sitl.partitions import Partition
 from sitl.plan import FlightPlan, FlyOptions, plan_flight
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
@@ -68,6 +70,8 @@ class Flight:
         coasted: (drone, frame) refused, and sent by attitude and motion alone.
         network: what the relay between the drones counted, if it did.
         features: (drone, frame) whose own fix rests on features, not on patches.
+        partitions: in which some did not hear others.
+        reset: (drone, frame) from which on the autopilot is told of a reset.
         error: (drone, frame) to the (6,) error of its pose, as MAVLink puts it.
     """
 
@@ -85,6 +89,8 @@ class Flight:
     coasted: frozenset[tuple[str, int]] = frozenset()
     features: frozenset[tuple[str, int]] = frozenset()
     network: NetworkLog | None = None
+    partitions: tuple[Partition, ...] = ()
+    reset: tuple[str, int] | None = None
     error: ErrorOf = field(default=lambda _drone, _frame: np.zeros(6))
 
 
@@ -122,7 +128,10 @@ def leave_behind(tmp_path: Path, flight: Flight) -> tuple[FlightPlan, Path]:
         for n in range(flight.n_drones):
             (attitude / f"mav{n}").mkdir(parents=True)
             (attitude / f"mav{n}" / "attitude.csv").write_text("at_ns,qw,qx,qy,qz\n")
-    plan = plan_flight(read_recording(recording), FlyOptions(attitude=attitude))
+    plan = plan_flight(
+        read_recording(recording),
+        FlyOptions(attitude=attitude, network=NetworkOptions(partitions=flight.partitions)),
+    )
     out = tmp_path / "out"
     prepare_folder(out, plan)
     encoded = encode_map(_landmark_map())
@@ -236,10 +245,14 @@ def _received(name: str, n: int, flight: Flight) -> list[dict[str, Any]]:
             x, y, z = truth.translation + error[:3]
             roll, pitch, yaw = np.add(euler_from_matrix(truth.rotation), error[3:])
             fields = {"usec": instant // 1000, "x": x, "y": y, "z": z, "roll": roll,
-                      "pitch": pitch, "yaw": yaw, "reset_counter": 0,
+                      "pitch": pitch, "yaw": yaw, "reset_counter": int(_is_reset(flight, name, k)),
                       "covariance": upper_from_covariance(np.diag(SIGMAS**2)).tolist()}  # fmt: skip
             lines.append({**heartbeat, "type": "VISION_POSITION_ESTIMATE", "fields": fields})
     return lines
+
+
+def _is_reset(flight: Flight, name: str, k: int) -> bool:
+    return flight.reset is not None and flight.reset[0] == name and k >= flight.reset[1]
 
 
 def _write_lines(path: Path, lines: list[dict[str, Any]]) -> None:

@@ -12,6 +12,7 @@ from rich.console import Console
 from sitl.network import Fate
 from sitl.network_log import NetworkLog
 from sitl.network_report import message_rows
+from sitl.partitions import parse_partition
 from sitl.peer_traffic import Traffic
 from sitl.processes import FlightError
 from sitl.reliance import RELIANCES
@@ -29,6 +30,7 @@ from tests.sitl.flights import (
     leave_behind,
     ned_from_body,
 )
+from vcl_companion.geometry.rotation import Array
 from vcl_companion.recording import NED_FROM_REFERENCE, read_recording
 from vcl_companion.recording.tum import read_tum
 
@@ -78,6 +80,48 @@ def test_the_report_has_exactly_the_keys_that_others_read(tmp_path: Path) -> Non
     assert {"revisions", "landmarks", "bytes"} <= set(report["map"])
     assert set(report["events"][0]) == {"at_s", "drone", "kind", "reason"}
     assert report["pipeline"] == "default"
+
+
+def test_a_partition_s_phases_are_told_apart(tmp_path: Path) -> None:
+    """Frames are 0.2 s apart; off by 0.3 m while apart, then told so and off by 0.1."""
+
+    def error(_: str, k: int) -> Array:
+        return np.array([0.0 if k < 3 else 0.3 if k < 8 else 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+    flight = Flight(
+        partitions=(parse_partition("0.5-1.5:mav0|mav1"),),
+        reset=("mav1", 8),
+        refused=frozenset({("mav1", 4)}),
+        error=error,
+    )
+    result, report, out = reported(tmp_path, flight)
+    before, apart, after = report["drones"]["mav1"]["phases"]
+    assert [p["phase"] for p in (before, apart, after)] == ["before", "apart", "after"]
+    assert (apart["from_s"], apart["until_s"]) == (0.5, 1.5)
+    assert [p["frames"] for p in (before, apart, after)] == [3, 5, 4]
+    assert [p["localized_share"] for p in (before, apart, after)] == [1.0, 0.8, 1.0]
+    # The leader's first pose is exact, so all is off as it was made to be.
+    assert [p["ate_m"] for p in (before, apart, after)] == pytest.approx([0.0, 0.3, 0.1])
+    assert [p["resets"] for p in (before, apart, after)] == [0, 0, 1]
+    # A step into a phase is that phase's.
+    for phase, step in ((before, 0.0), (apart, 0.3), (after, 0.0)):
+        assert phase["largest_step_m"] == pytest.approx(step, abs=1e-9)
+    unannounced = report["drones"]["mav0"]["phases"][2]
+    assert unannounced["resets"] == 0
+    assert unannounced["largest_step_m"] == pytest.approx(0.2)
+    page = page_of(result, out)
+    assert "Apart and together" in page
+    assert "apart, 0.5-1.5 s" in page
+    console = Console(file=io.StringIO(), width=120)
+    show_report(console, report, out)
+    assert isinstance(console.file, io.StringIO)
+    assert "apart, 0.5-1.5 s" in console.file.getvalue()
+
+
+def test_without_a_partition_there_are_no_phases(tmp_path: Path) -> None:
+    result, report, out = reported(tmp_path, Flight())
+    assert report["drones"]["mav0"]["phases"] == []
+    assert "Apart and together" not in page_of(result, out)
 
 
 def test_numbers_are_those_of_the_logs(tmp_path: Path) -> None:
