@@ -15,8 +15,10 @@ from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.transfer import BlobKind, Transfers
+from vcl_companion.wire.chunks import Chunk
 from vcl_companion.wire.map_codec import revision_of
 from vcl_companion.wire.messages import MapState
+from vcl_companion.wire.tunnel import decode_payload
 
 OURS = revision_of(demo.encoded_map(1, 2))
 THEIRS = MapState(b"another!", 900, True)
@@ -35,6 +37,13 @@ def handing(group: Group, maps: MapStore, transfers: Transfers) -> MapHanding:
     return MapHanding(
         group, transfers, maps, work, passed, MapBranches(group, maps, lambda: False, 20.0)
     )
+
+
+def tags(transfers: Transfers, now_s: float) -> set[int]:
+    """Of what is sent now."""
+    payloads = transfers.poll(now_s)[0]
+    messages = [decode_payload(one.payload_type, one.payload) for one in payloads]
+    return {message.tag for message in messages if isinstance(message, Chunk)}
 
 
 class Member:
@@ -108,11 +117,49 @@ def test_a_map_that_was_replaced_does_not_reach_who_was_away_when_it_is_back() -
     run(scenario())
 
 
-def test_what_the_drone_that_gave_us_our_map_makes_of_it_is_taken_meanwhile() -> None:
+def test_a_map_on_its_way_before_a_gap_is_not_sent_on_beside_its_successor() -> None:
+    async def scenario() -> None:
+        group, maps = Group(SwarmOptions((1, 2)), 1), MapStore("")
+        transfers = Transfers(FAST, np.random.default_rng(0))
+        hands = handing(group, maps, transfers)
+        maps.replace(demo.encoded_map(1, 2), demo.map_index(1, 2))
+        group.set_own_state(MapState(OURS, 900, True))
+        group.map_state(2, MapState(b"", 0, False), 0.0)
+        hands.hand_out(0.0)
+        before = tags(transfers, 0.0)
+        assert before
+        group.poll(20.0)
+        group.map_state(2, MapState(b"", 0, False), 21.0)
+        hands.forgot(2)  # it is back
+        maps.replace(demo.encoded_map(1, 2, 3), demo.map_index(1, 2, 3))
+        hands.hand_out(21.0)
+        after = tags(transfers, 21.0) | tags(transfers, 21.5)
+        assert after
+        assert not before & after
+
+    run(scenario())
+
+
+def test_what_the_drone_that_gave_us_our_map_makes_of_it_is_taken_for_a_moment() -> None:
     member = Member()
     member.branches.given_by(3)
     member.group.map_state(1, THEIRS, 0.0)
-    assert member.branches.goes_on_by(3)
-    assert not member.branches.goes_on_by(1)
-    member.group.map_state(1, MapState(OURS, 900, True), 0.0)
-    assert not member.branches.goes_on_by(3)
+    member.branches.receiver(0.0)
+    assert member.branches.goes_on_by(3, 2.0)
+    assert not member.branches.goes_on_by(1, 2.0)
+    assert not member.branches.goes_on_by(3, 4.0)  # who hears no coordinator goes on for ever
+    member.group.map_state(1, MapState(OURS, 900, True), 4.0)
+    assert not member.branches.goes_on_by(3, 4.0)
+
+
+def test_who_makes_one_map_after_the_other_is_not_waited_for_any_longer() -> None:
+    member = Member()
+    awaited = []
+    for n in range(40):
+        member.group.map_state(3, MapState(b"map %4d" % n, 900, True), float(n))
+        awaited.append(member.branches.is_awaited(3, float(n)))
+    assert awaited == [True] * 20 + [False] * 20
+    member.group.map_state(3, MapState(OURS, 900, True), 40.0)
+    assert not member.branches.is_awaited(3, 40.0)
+    member.group.map_state(3, THEIRS, 41.0)  # it went apart once more
+    assert member.branches.is_awaited(3, 41.0)

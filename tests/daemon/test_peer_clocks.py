@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -189,7 +190,7 @@ async def knows_of_time(*drones: Drone) -> None:
     await passes_until(lambda: all(drone.lines("clock") for drone in drones))
 
 
-@pytest.mark.parametrize(("n_members", "every_s"), [(2, 8.0), (30, 29.0)])
+@pytest.mark.parametrize(("n_members", "every_s"), [(2, 8.0), (9, 8.0)])
 def test_who_is_alive_is_asked_quickly_at_first_and_then_rarely(
     n_members: int, every_s: float
 ) -> None:
@@ -227,6 +228,40 @@ def test_who_is_alive_is_asked_quickly_at_first_and_then_rarely(
         assert 4 * n_peers <= len(asked) - n_steady <= 5 * n_peers
         assert 3 * n_peers <= n_steady <= 4 * n_peers
         assert 2 * 43 * n_steady / (4 * every_s) < 90.0
+
+    run(scenario())
+
+
+def test_in_a_large_group_those_are_asked_that_a_drone_deals_with() -> None:
+    async def scenario() -> None:
+        clock = ManualClock(50 * SECOND)
+        group = Group(SwarmOptions(tuple(range(1, 31))), 7)
+        asked: Counter[int] = Counter()
+        clocks = PeerClocks(
+            group, lambda _, peer: asked.update([peer]), clock, FlightLog("", clock),
+            lambda *_: None, 0,
+        )  # fmt: skip
+
+        async def lets_pass(seconds: float) -> None:
+            end_s = now_s() + seconds
+            while now_s() < end_s:
+                for peer in group.peers:
+                    for _ in group.heartbeat(peer, now_s()):
+                        clocks.joined(peer)
+                await passes(0.5)
+
+        async with beside(clocks.run()):
+            await lets_pass(60.0)
+            assert set(asked) == {1}  # who coordinates
+            clocks.instant(12, 5, 0.0, 9)
+            await lets_pass(20.0)
+            assert set(asked) == {1, 12}
+            asked.clear()
+            await lets_pass(300.0)  # nothing was heard of it for so long
+            before = asked[12]
+            await lets_pass(60.0)
+            assert asked[12] == before > 0
+            assert 360 / 29 - 2 <= asked[1] <= 360 / 29 + 2
 
     run(scenario())
 

@@ -103,6 +103,19 @@ def test_what_the_image_does_not_show_as_well_is_not_believed(first: LandmarkMap
     assert error_of(first, replace(coarse(body), told_px=lied), body) == honest
 
 
+@pytest.mark.parametrize("lie", ["shifted", "scaled"])
+def test_what_is_off_as_a_whole_is_not_believed(first: LandmarkMap, lie: str) -> None:
+    """No single landmark of it is as far off as an encoder may put it."""
+    body = NEXT[2]
+    honest = told(first, body)
+    centre = np.array([CAMERA.cx_px, CAMERA.cy_px])
+    off = np.array([0.25, -0.2]) if lie == "shifted" else 0.003 * (honest - centre)
+    assert np.nanmax(np.linalg.norm(honest + off - honest, axis=1)) < 0.7
+    alone = error_of(first, coarse(body), body)
+    assert error_of(first, replace(coarse(body), told_px=honest + off), body) == alone
+    assert error_of(first, replace(coarse(body), told_px=honest), body) != alone
+
+
 def test_of_another_map_nothing_is_told(first: LandmarkMap) -> None:
     body = NEXT[0]
     one, where = seen(first, body), body @ MOUNTING

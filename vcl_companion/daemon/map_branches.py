@@ -21,6 +21,9 @@ from vcl_companion.wire.header import BlobKind
 # A coordinator whose map we do not know is about to send it, as a rule, if it had ours before. If
 # it had not, it knows nothing of what ours has in it: there is time to hear what it says next.
 _SENDS_S, _SAYS_S = 5.0, 1.0
+# So long after the coordinator's has become another one, ours goes on by whoever gave it to us.
+# Then it is handed over as it is: who cannot reach the coordinator would keep us from it for ever.
+_GOES_ON_S = 3.0
 _MAX_REFUSED = 64
 
 
@@ -45,19 +48,22 @@ class MapBranches:
         self._refused: deque[bytes] = deque(maxlen=_MAX_REFUSED)
         self._had_ours: tuple[bytes, set[int]] = (b"", set())
         self._merged: set[int] = set()  # other teams' coordinators, whose map is in ours
-        self._foreign_since_s: dict[int, tuple[bytes, float]] = {}
+        self._foreign_since_s: dict[int, float] = {}
 
     def given_by(self, peer: int) -> None:
         """Note who has given us the map in use, ourselves perhaps."""
         self._given_by = peer
 
-    def goes_on_by(self, peer: int) -> bool:
-        """Whether our map is a peer's, and the coordinator's is another that it will go into.
+    def goes_on_by(self, peer: int, now_s: float) -> bool:
+        """Whether our map is a peer's, and the coordinator's another that it is about to go into.
 
-        Until then what the peer makes of it is taken, or its part of the swarm would fly on two.
+        What the peer had begun to make of it is taken, or its part of the swarm would fly on two.
         """
-        state = self._group.state_of(self._group.coordinator)
-        return self._given_by == peer and state is not None and self._is_foreign(state.revision)
+        coordinator = self._group.coordinator
+        state = self._group.state_of(coordinator)
+        is_foreign = state is not None and self._is_foreign(state.revision)
+        since_s = self._foreign_since_s.get(coordinator, now_s)
+        return self._given_by == peer and is_foreign and now_s < since_s + _GOES_ON_S
 
     def refused(self, revision: bytes) -> None:
         """Note a map that cannot be merged with ours."""
@@ -74,11 +80,8 @@ class MapBranches:
         if not self._is_foreign(revision):
             self._foreign_since_s.pop(peer, None)
             return False
-        known, since_s = self._foreign_since_s.get(peer, (b"", now_s))
-        if known != revision:
-            since_s = now_s
-        self._foreign_since_s[peer] = revision, since_s
-        return now_s < since_s + self._wait_s
+        # Not from each of its revisions on: one that is never handed over would be waited for.
+        return now_s < self._foreign_since_s.setdefault(peer, now_s) + self._wait_s
 
     def receiver(self, now_s: float) -> int | None:
         """Return whom to hand our map so that it is merged into its own; None for nobody."""
@@ -95,7 +98,7 @@ class MapBranches:
         if state is None or not (is_line_of_another and self._is_foreign(state.revision)):
             self._foreign_since_s.pop(coordinator, None)
             return None
-        _, since_s = self._foreign_since_s.setdefault(coordinator, (state.revision, now_s))
+        since_s = self._foreign_since_s.setdefault(coordinator, now_s)
         wait_s = _SENDS_S if coordinator in self._had_ours[1] else _SAYS_S
         if now_s < since_s + wait_s or self._is_receiving():
             return None

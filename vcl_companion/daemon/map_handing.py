@@ -103,7 +103,9 @@ class MapHanding:
 
     def forgot(self, peer: int) -> None:
         """Note that a peer may have lost the map it was handed: it was restarted, or away."""
-        self._handed.pop(peer, None)
+        last = self._handed.get(peer)
+        if last is not None:
+            self._handed[peer] = replace(last, n_delivered=0, again_at_s=float("-inf"))
         self._parts.forgot(peer)
 
     def delivered(self, peer: int, transfer_id: int, now_s: float) -> None:
@@ -170,6 +172,8 @@ class MapHanding:
             return
         kind, blob = form
         sent_id = self._transfers.submit(peer, kind, blob, now_s)
+        if last is not None and last.transfer_id != sent_id:
+            self._transfers.cancel(last.transfer_id)  # the same map in another form
         self._handed[peer] = _Handed(stored.revision, sent_id, n_delivered, now_s + _HAND_AGAIN_S)
 
     def _form_for(

@@ -294,14 +294,10 @@ class MapRounds:
                 if self._is_past(stored):
                     return
                 await self._decide(built, stored, request_id)
+                self._note_places(built, stored)
                 shown = {(k.drone_id, k.captured_at_ns) for k in built.keyframes}
                 left_out = [f for f in frames if (f.drone_id, f.captured_at_ns) not in shown]
-                self._is_from_new_places = any(
-                    _is_newer(f, stored, self._options.update.novelty_deg)
-                    for f in frames
-                    if f not in left_out
-                )
-                frames = [f for f in left_out if f.drone_id in lost or _is_newer(f, stored)]
+                frames = [f for f in left_out if f.drone_id in lost or _is_far(f, stored)]
                 current = self._maps.current
                 if not frames or current is None:
                     return
@@ -314,6 +310,20 @@ class MapRounds:
             self._passed.over()
         if not self._is_past(stored):
             await self._decide(built, stored, request_id)
+            if isinstance(built, LandmarkMap):
+                self._note_places(built, stored)
+
+    def _note_places(self, built: LandmarkMap, stored: StoredMap) -> None:
+        """Note whether a map, if it is in use now, was extended from places that were new to it."""
+        current, old = self._maps.current, stored.index.landmark_map
+        if current is None or current.parent != stored.revision:
+            return
+        known = {(k.drone_id, k.captured_at_ns) for k in old.keyframes}
+        for k in built.keyframes:
+            if (k.drone_id, k.captured_at_ns) not in known:
+                newness = novelty_from(old, k.world_from_body @ k.body_from_cam, k.camera)
+                if newness is None or newness > self._options.update.novelty_deg:
+                    self._is_from_new_places = True
 
     async def _delivered(self, stored: StoredMap) -> None:
         """Wait until everybody alive has a revision, as long as a round would."""
@@ -384,13 +394,13 @@ class MapRounds:
         return asyncio.get_running_loop().time()
 
 
-def _is_newer(frame: FrameAnswer, stored: StoredMap, than_deg: float = NEAR_DEG) -> bool:
-    """Whether a frame shows a map so differently; ``NEAR_DEG``: that only features may join it."""
+def _is_far(frame: FrameAnswer, stored: StoredMap) -> bool:
+    """Whether a frame shows a map so differently that only features may join it, if at all."""
     if frame.world_from_body is None:
         return True
     world_from_cam = frame.world_from_body @ frame.body_from_cam
     novelty_deg = novelty_from(stored.index.landmark_map, world_from_cam, frame.camera)
-    return novelty_deg is None or novelty_deg > than_deg
+    return novelty_deg is None or novelty_deg > NEAR_DEG
 
 
 def _listed(drones: tuple[int, ...]) -> str:

@@ -36,6 +36,7 @@ _log = logging.getLogger(__name__)
 # A map that has stayed for so long is likely to stay: it is indexed by all detectors, before
 # somebody is lost in it. In fast flight the next one comes sooner.
 _STAYS_S = 3.0
+_BETWEEN_MERGES_S = 0.5
 # A map that was refused may come again after this: we may know better by then.
 _LOOK_AGAIN_S = 5.0
 # Ours changes while it is merged with another one, but hardly so often.
@@ -167,6 +168,8 @@ class MapSharing:
             return await self._merge_into_current(peer, offer)
         finally:
             self.is_merging = False
+            # Whoever offers one after the other does not keep ours from being extended.
+            await asyncio.sleep(_BETWEEN_MERGES_S)
 
     async def _merge_into_current(self, peer: int, offer: MapOffer) -> bool:
         self._log.event("merge", f"map {offer.revision.hex()} of drone {peer} into ours")
@@ -327,7 +330,7 @@ class MapSharing:
         if self._branches.comes_from_senior(peer):
             return None
         if peer != group.coordinator:
-            if offer.parent == current.revision and self._branches.goes_on_by(peer):
+            if offer.parent == current.revision and self._branches.goes_on_by(peer, self._now_s()):
                 return None
             return "map, but not from the coordinator"
         if not group.may_lead(peer):

@@ -23,6 +23,9 @@ _LEAST_BETWEEN_S = 1.0
 # Of many that have joined so many are asked at a time, of those that are asked rarely one: in a
 # large group everybody asking everybody at once would leave the air for nothing else.
 _MOST_QUICK_AT_ONCE = 2
+# More than so many peers are not all asked: the coordinator, whom everybody deals with, and whoever
+# has spoken of an instant in so long, s. What a drone says does not grow with the swarm then.
+_FEW_PEERS, _DEALT_WITH_S = 8, 120.0
 # Who has been asked so many without a relation that holds is asked rarely from then on.
 _MOST_QUICK = 8
 _LOG_EVERY_S = 5.0
@@ -30,7 +33,9 @@ _LONGEST_PAUSE_S = 0.5
 
 
 class PeerClocks:
-    """Asks every member alive for its time: a few at a time quickly after they joined, then rarely.
+    """Asks members alive for their time: a few at a time quickly after they joined, then rarely.
+
+    In a small group all of them, in a large one those that this drone deals with.
 
     Args:
         group: whom to ask.
@@ -57,6 +62,7 @@ class PeerClocks:
         self._refuse = refuse
         self._times = {peer: PeerTime(resolution_ns) for peer in group.peers}
         self._asked_at_s: dict[int, float] = {}
+        self._dealt_with_at_s: dict[int, float] = {}
         self._n_quick: Counter[int] = Counter()
         self._logged_at_s: dict[int, float] = {}
         self._wake = asyncio.Event()
@@ -87,6 +93,7 @@ class PeerClocks:
 
     def instant(self, peer: int, theirs_ns: int, age_s: float, came_at_ns: int) -> Instant:
         """Return an instant that a peer speaks of in our time; see ``PeerTime.instant``."""
+        self._dealt_with_at_s[peer] = self._now_s()
         return self._times[peer].instant(theirs_ns, age_s, came_at_ns)
 
     async def run(self) -> None:
@@ -103,8 +110,12 @@ class PeerClocks:
 
     def _whose_turn(self) -> list[int]:
         """Return whom to ask now: who coordinates, which everybody deals with, then by age."""
-        due = [p for p in self._group.alive if p in self._times and self._is_due(p)]
         coordinator = self._group.coordinator
+        due = [
+            p
+            for p in self._group.alive
+            if p in self._times and (p == coordinator or self._is_dealt_with(p)) and self._is_due(p)
+        ]
         due.sort(key=lambda p: (p != coordinator, self._asked_at_s.get(p, float("-inf"))))
         rare = [peer for peer in due if self._is_rare(peer)]
         quick = [peer for peer in due if not self._is_rare(peer)]
@@ -125,6 +136,12 @@ class PeerClocks:
         # A turn comes a little early or late: due is what the next one would be too late for.
         since_s = self._now_s() - self._asked_at_s.get(peer, float("-inf"))
         return since_s >= every_s - _LONGEST_PAUSE_S / 2
+
+    def _is_dealt_with(self, peer: int) -> bool:
+        if len(self._times) <= _FEW_PEERS:
+            return True
+        at_s = self._dealt_with_at_s.get(peer)
+        return at_s is not None and self._now_s() < at_s + _DEALT_WITH_S
 
     def _is_rare(self, peer: int) -> bool:
         return self._times[peer].is_settled or self._n_quick[peer] >= _MOST_QUICK

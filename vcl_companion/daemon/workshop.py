@@ -43,8 +43,8 @@ from vcl_companion.wire.map_update import encode_map_update
 _N_MAPS = 2
 # Beside a map's keyframes, the frames of a round: one of each contributor, several of who is lost.
 _N_NEW_IMAGES = 16
-# Landmarks whose place in a frame is told: more of them fix its pose no better.
-_MOST_SEEN = 800
+# Landmarks that are looked for in a frame, to tell where it shows them: half are found.
+_MOST_SEEN = 1000
 # Less of a map would not tell where one is.
 _LEAST_KEYFRAMES, _LEAST_LANDMARKS = 2, 100
 

@@ -8,19 +8,17 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.localization.intra import Prior
 from vcl_companion.localization.tracking import TrackingOptions
+from vcl_companion.mapping.patch_table import EXACTLY
 from vcl_companion.mapping.seen_landmarks import MAX_ASIDE_PX, SeenLandmarks
 from vcl_companion.mapping.templates import Templates
 from vcl_companion.vision.features import Image
 from vcl_companion.vision.patches import (
-    AlignRules,
     align_patches,
     choose_anchors,
     lens_of,
     pyramid_of,
 )
 
-# As exactly, and as strictly, as the extension looks for them in the encoded image.
-_RULES = AlignRules(max_iterations=15, least_score=0.85, max_moved_px=1.5, settled_px=0.02)
 _MARGIN_PX = 6.0
 
 
@@ -59,7 +57,7 @@ def seen_by_patches(
     cam_from_world = (where.world_from_body @ body_from_cam).inverse()
     found = align_patches(
         templates.anchors, rows, pyramid_of(image), lens, cam_from_world, np.zeros(len(rows)), 0,
-        _RULES,
+        EXACTLY,
     )  # fmt: skip
     found = found.of(found.found)
     aside = found.pixels - camera.project(cam_from_world.apply(found.points_world))

@@ -25,6 +25,7 @@ from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.new_landmarks import Shown, free_of, new_landmarks, shown, with_room
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.patch_table import (
+    EXACTLY,
     PatchTable,
     PyramidOf,
     Reference,
@@ -39,14 +40,12 @@ from vcl_companion.mapping.uncertainty import MapUncertainty, views_of
 from vcl_companion.mapping.weighing import adjust_weighed
 from vcl_companion.vision.bundle import BundleOptions, Distance, Views
 from vcl_companion.vision.features import Detector, Features
-from vcl_companion.vision.patches import AlignRules
 from vcl_companion.vision.resection import NotFound
 
 ImageFeatures = Callable[[bytes, Camera, Detector], Features]
 
 # Old keyframes that a new view is matched with, besides all other new views.
 _PARTNERS = 3
-_AGAIN = AlignRules(max_iterations=15, least_score=0.85, max_moved_px=1.5, settled_px=0.02)
 _RELATIVE_SIGMA = 0.02
 _STEPS, _LEAST_GAIN = (8, 12), (1e-3, 1e-4)
 # Old keyframes that an extension may still move: so many; of a map of more no more than half of
@@ -56,8 +55,11 @@ _NEAREST, _SHARED = 9, 40
 # Residuals of patches that are the same spot: first loosely, by poses not adjusted yet.
 _LIMIT_PX, _CAUCHY_PX = (1.5, 0.5), (0.5, SETTLED_CAUCHY_PX)
 _MAX_SIGMAS = 4.0
-# An encoder shifts no patch that is found again by more.
-_TOLD_PX = 0.5
+# An encoder shifts no patch that is found again by more; all of an image by no more than this,
+# root mean square, but for what so few patches have in common by chance.
+_TOLD_PX, _COMMON_PX, _BY_CHANCE = 0.5, 0.03, 3.0
+# Of fewer patches nothing of that kind can be told.
+_LEAST_TOLD = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +268,7 @@ class Extension:
             which, reference = references(
                 known, self._cameras[c], cams[c], self._relative[old], len(old)
             )
-            found = self._table.found(reference, cams, [c], _AGAIN)
+            found = self._table.found(reference, cams, [c], EXACTLY)
             observed[old, c] = np.nan
             observed[old[which], c] = _told(
                 found.pixels[:, c], self._views[joined[at]].told_px, old[which]
@@ -284,7 +286,7 @@ class Extension:
                 table.points[fresh],
                 np.full(len(fresh), _RELATIVE_SIGMA),
             )
-            found = self._table.found(reference, cams, [*range(self._n_keys), *columns], _AGAIN)
+            found = self._table.found(reference, cams, [*range(self._n_keys), *columns], EXACTLY)
             observed[fresh], noise[fresh] = found.pixels, landmark_noise(found.noise)
         return replace(table, observed=observed, noise=noise)
 
@@ -317,12 +319,23 @@ class Extension:
 def _told(found: Array, told_px: Array | None, landmarks: Index) -> Array:
     """Return (M, 2) what is found of landmarks in an encoded image, by the image itself if told.
 
-    Only where both are about the same: what a peer tells is never taken without the image.
+    Only where both are about the same, and not if all of it is shifted, scaled or turned against
+    the encoded image: an encoder errs here and there, and nothing else would show such a lie.
     """
     if told_px is None:
         return found
     told = told_px[landmarks]
-    agrees = np.linalg.norm(told - found, axis=1) < _TOLD_PX  # never where one of both is not there
+    off = told - found
+    agrees = np.linalg.norm(off, axis=1) < _TOLD_PX  # never where one of both is not there
+    n = int(agrees.sum())
+    if n < _LEAST_TOLD:
+        return found
+    at = (found[agrees] - found[agrees].mean(axis=0)) / max(float(found[agrees].std()), 1.0)
+    basis = np.column_stack([np.ones(n), at])
+    common = basis @ np.linalg.lstsq(basis, off[agrees], rcond=None)[0]
+    by_chance = off[agrees].std() * np.sqrt(basis.shape[1] / n)
+    if np.sqrt((common**2).mean()) > _COMMON_PX + _BY_CHANCE * by_chance:
+        return found
     return np.where(agrees[:, None], told, found)
 
 

@@ -38,6 +38,8 @@ from vcl_companion.vision.features import Detector
 
 # So many landmarks of both tell how two maps of one world stand, whatever else there is.
 _PLENTY = 5 * MIN_COMMON
+# A landmark that is off by more than this share of its distance may be its neighbour's like.
+_SLIPPED = 0.05
 # The table of all landmarks in all keyframes is as large as peers take one at most.
 _MAX_CELLS = 1 << 20
 # Residuals, in units of the last limit, and steps: a map may be bent before it is adjusted.
@@ -125,10 +127,31 @@ def _aligned(
     if one_world:
         few = common_where_expected(one.map, other.map, *libraries(options.detectors[:1]))
         stands = aligned(one, other, few, options, seed, one_world=True)
-        if isinstance(stands, Aligned) and len(stands.common.senior) >= _PLENTY:
+        if isinstance(stands, Aligned) and _is_as_expected(stands, one, other):
             return stands
     common = common_landmarks(one.map, other.map, *libraries(options.detectors))
     return aligned(one, other, common, options, seed, one_world=one_world)
+
+
+def _is_as_expected(stands: Aligned, one: Side, other: Side) -> bool:
+    """Whether maps of one world stand as they say, or the pairs that were looked at may mislead.
+
+    They were chosen by where both maps say that they are: had one slipped, along a facade with
+    windows like windows, what speaks for its true place was not looked at.
+    """
+    common = stands.common
+    if len(common.senior) < _PLENTY:
+        return False
+    if common.certain.sum() >= MIN_COMMON:
+        return True
+    points = other.map.points_world[common.junior]
+    moved = np.linalg.norm(one.map.points_world[common.senior] - points, axis=1)
+    seen_by = other.map.seen[common.junior].argmax(axis=1)
+    centres = np.array(
+        [(k.world_from_body @ k.body_from_cam).translation for k in other.map.keyframes]
+    )
+    away = np.linalg.norm(points - centres[seen_by], axis=1)
+    return bool(np.median(moved) < _SLIPPED * np.median(away))
 
 
 def _needless(

@@ -30,6 +30,9 @@ from vcl_companion.vision.patches import (
     pyramid_of,
 )
 
+# Patches near where they are known to be: by who extends a map, and who tells what it sees of it.
+EXACTLY = AlignRules(max_iterations=15, least_score=0.85, max_moved_px=1.5, settled_px=0.02)
+
 PyramidOf = Callable[[bytes, Camera], Pyramid]
 
 _MARGIN_PX = 7.0

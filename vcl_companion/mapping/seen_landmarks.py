@@ -1,7 +1,7 @@
 """Where an image shows landmarks of a map, measured before it was encoded.
 
-An encoded image is a few hundredths of a pixel off here and there, and a view is placed on the
-map by what is measured in it. Whoever took it has the image itself, and tells in some hundred
+An encoded image is some tenths of a pixel off here and there, and a view is placed on the map by
+what is measured in it. Whoever took it has the image itself, and tells in some hundred
 bytes what that shows.
 """
 

@@ -30,8 +30,9 @@ __all__ = ["Group", "GroupEvent", "PeerJoined", "PeerLost", "SwarmOptions"]
 
 # A signature is told no more often: 48 bytes more each time.
 _SIGNATURE_INTERVAL_S = 2.9
-# Who has said nothing for this share of the time-out is not waited for any more.
-_SILENT = 0.5
+# Who has said nothing for this share of the time-out, and for so long, s, is not waited for any
+# more; it speaks once a second.
+_SILENT, _SILENT_S = 0.5, 2.5
 _SAID_NOTHING = MapState(b"", 0, False)
 
 
@@ -295,7 +296,9 @@ class Group:
         )
 
     def lacking(self) -> tuple[int, ...]:
-        """Return the teammates trusted that do not hold the newest revision; none without one.
+        """Return the teammates that do not hold the newest revision; none without one.
+
+        Of those that are trusted, not silent, and not on a map of their own (``leave_apart``).
 
         A member that said nothing of its map yet lacks it.
         """
@@ -306,7 +309,7 @@ class Group:
 
     @property
     def wanting_update(self) -> tuple[int, ...]:
-        """Teammates trusted whose vote is for an update of the newest revision (IV-G).
+        """Teammates whose vote is for an update of the newest revision (IV-G).
 
         The vote of one that still flies on another revision is about that one,
         and does not count.
@@ -318,7 +321,7 @@ class Group:
 
     @property
     def majority_wants_update(self) -> bool:
-        """Whether more than half of the teammates trusted vote for an update."""
+        """Whether more than half of those that have a vote (``lacking``) are for an update."""
         return 2 * len(self.wanting_update) > len(self._electorate)
 
     @property
@@ -331,7 +334,8 @@ class Group:
     def _is_silent(self, member: int) -> bool:
         """Whether a member may be lost, which is known later: nobody else waits for its word."""
         heard_at_s = self._heard_at_s.get(member)
-        return heard_at_s is not None and self._now_s >= heard_at_s + _SILENT * self._timeout_s
+        silent_s = max(_SILENT * self._timeout_s, _SILENT_S)
+        return heard_at_s is not None and self._now_s >= heard_at_s + silent_s
 
     def most_others_hold(self, revision: bytes) -> bool:
         """Whether most of the other teammates trusted, and at least two, hold a revision."""

@@ -19,7 +19,7 @@ as long from now as the last update took, from the majority's wish to the map):
   inherited by whatever is added to the map later.
 
 A vote stands for half a second after its reason, so that those of a majority meet. When the
-majority of the members alive votes so, the coordinator makes one. A drone alone is the
+majority of the teammates that are heard votes so, the coordinator makes one. A drone alone is the
 majority.
 """
 

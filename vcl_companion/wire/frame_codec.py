@@ -69,8 +69,8 @@ class FrameAnswer:
             flew on; None when it does not know.
         has_heading: whether the attitude's heading is by the world's north, as far as
             that drone knows; else only its roll and pitch tell others anything.
-        seen: where the image, before it was encoded, shows landmarks of the map that the
-            pose is on; None where that is not told.
+        seen: where the image, before it was encoded, shows landmarks of a map, seen from that
+            pose; None where that is not told.
     """
 
     drone_id: int
