@@ -95,6 +95,27 @@ def test_the_first_of_those_who_have_it_hands_it() -> None:
     assert third.handed_at_s() is None
 
 
+def test_until_a_part_has_said_what_it_has_or_long_enough_ours_goes_on_without_it() -> None:
+    async def scenario() -> None:
+        group, maps = Group(SwarmOptions((1, 2, 3)), 1), MapStore("")
+        hands = handing(group, maps, Transfers(FAST, np.random.default_rng(0)))
+        maps.replace(demo.encoded_map(1, 2), demo.map_index(1, 2))
+        group.set_own_state(MapState(OURS, 900, True, wants_update=True))
+        lacking = []
+        for n in range(25):
+            for peer in (2, 3):
+                group.map_state(peer, THEIRS, float(n))
+            hands.hand_out(float(n))
+            lacking.append(group.lacking())
+            assert group.majority_wants_update == (not lacking[-1])
+        assert lacking == [()] * 20 + [(2, 3)] * 5
+        group.map_state(3, MapState(OURS, 900, True), 25.0)
+        hands.hand_out(25.0)
+        assert group.lacking() == (2,)
+
+    run(scenario())
+
+
 def test_a_map_that_was_replaced_does_not_reach_who_was_away_when_it_is_back() -> None:
     async def scenario() -> None:
         group, maps = Group(SwarmOptions((1, 2, 3)), 1), MapStore("")

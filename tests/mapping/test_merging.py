@@ -264,6 +264,16 @@ def test_in_one_world_only_those_are_compared_that_show_the_same() -> None:
     assert len(few.senior) > 0.7 * len(everything.senior) > 100
 
 
+def test_a_map_that_is_not_where_its_world_says_is_compared_with_all() -> None:
+    given = two(0)
+    claims = replace(given.junior, parent=b"parent  ", world=b"senior  ")
+    found = merged(
+        given.senior, b"senior  ", claims, b"junior  ", features_in(given.views), OPTIONS
+    )
+    assert isinstance(found, LandmarkMap), found
+    assert_right(found, given.scene, given.views, within_m=0.15)
+
+
 def test_maps_of_different_places_are_not_merged() -> None:
     away = tuple(
         replace(pose, translation=pose.translation + np.array([0.0, 32.0, 0.0])) for pose in OTHERS
