@@ -197,6 +197,7 @@ class Exchange:
             options.update.delivery_wait_s,
             len(options.detectors) > 1,
             estimator.carry,
+            lambda: self._rounds.progress != 255,
         )
         self.inter = InterTarget(
             system_id,

@@ -10,6 +10,7 @@ import logging
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import replace
 
 from vcl_companion.daemon.flight_log import FlightLog
@@ -37,6 +38,8 @@ _log = logging.getLogger(__name__)
 # somebody is lost in it. In fast flight the next one comes sooner.
 _STAYS_S = 3.0
 _BETWEEN_MERGES_S = 0.5
+# A round that ours is being updated in is let end before ours is merged, but not for longer.
+_ROUND_S, _LOOK_S = 5.0, 0.05
 # A map that was refused may come again after this: we may know better by then.
 _LOOK_AGAIN_S = 5.0
 # Ours changes while it is merged with another one, but hardly so often.
@@ -63,6 +66,7 @@ class MapSharing:
             have left may take to be brought up to date; then it has its way.
         falls_back: whether maps are indexed by other detectors too, sooner or later.
         carry: takes what is believed of our pose to another map's world.
+        is_updating: whether a round of ours is under way that updates the map.
 
     Attributes:
         handing: whom ours is handed to.
@@ -84,6 +88,7 @@ class MapSharing:
         delivery_wait_s: float,
         falls_back: bool,
         carry: Callable[[Similarity], None],
+        is_updating: Callable[[], bool],
     ) -> None:
         self._group = group
         self._transfers = transfers
@@ -99,6 +104,7 @@ class MapSharing:
         self._falls_back = falls_back
         self._contradicting: deque[tuple[int, bytes]] = deque(maxlen=_N_CONTRADICTING)
         self._carry = carry
+        self._is_updating = is_updating
         self._branches = MapBranches(group, maps, self._is_receiving, delivery_wait_s)
         self._offered: PeerMailbox[MapOffer] = PeerMailbox()
         self.is_merging = False
@@ -165,11 +171,22 @@ class MapSharing:
         """Make our next revision of ours and a peer's that went apart; whether that was done."""
         self.is_merging = True
         try:
+            await self._round_is_over()
             return await self._merge_into_current(peer, offer)
         finally:
             self.is_merging = False
             # Whoever offers one after the other does not keep ours from being extended.
             await asyncio.sleep(_BETWEEN_MERGES_S)
+
+    async def _round_is_over(self) -> None:
+        """Wait for the round that is under way: merged with what it replaces, all would be in vain.
+
+        Another one does not begin meanwhile.
+        """
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_ROUND_S):
+                while self._is_updating():
+                    await asyncio.sleep(_LOOK_S)
 
     async def _merge_into_current(self, peer: int, offer: MapOffer) -> bool:
         self._log.event("merge", f"map {offer.revision.hex()} of drone {peer} into ours")
