@@ -31,7 +31,7 @@ from vcl_companion.wire.pose_codec import MAX_COORDINATE_M, rounded_pose
 Flags = NDArray[np.bool_]
 
 _STEPS_PER_M = 1 << 12
-_STEPS_PER_PX = 1 << 5
+STEPS_PER_PX = 1 << 5
 _MARGIN_PX = 1.0  # a subpixel peak may lie a little outside of the image
 # Added to the square of every baseline: cameras are not where their bodies are.
 _LEAST_BASELINE_M2 = 1.0
@@ -71,13 +71,13 @@ class Views:
         ]
         self._cams_from_worlds = [pose.inverse() for pose in self._worlds_from_cams]
         sizes_px = np.array([(c.width_px, c.height_px) for c in self._cameras], dtype=np.int64)
-        self.largest: Integers = (sizes_px + int(_MARGIN_PX)) * _STEPS_PER_PX
+        self.largest: Integers = (sizes_px + int(_MARGIN_PX)) * STEPS_PER_PX
         at = np.array([body.translation for body in bodies])
         # No sums of products by a library: the same on every machine, as it has to be here.
         x, y, z = (at[:, None] - at).transpose(2, 0, 1)
         baselines_m = np.sqrt(x * x + y * y + z * z + _LEAST_BASELINE_M2)
         focal_px = np.array([c.fx_px for c in self._cameras])
-        exponents = np.frexp(_STEPS_PER_PX * focal_px[:, None] * baselines_m)[1]
+        exponents = np.frexp(STEPS_PER_PX * focal_px[:, None] * baselines_m)[1]
         self.exponents: Integers = np.clip(exponents, 0, 40).astype(np.int64)
 
     def anchors(self, seen: Flags) -> tuple[Integers, Integers]:
@@ -158,7 +158,7 @@ class Views:
         in_cam = _moved(self._cams_from_worlds[i], points)
         with np.errstate(all="ignore"):
             pixels = self._cameras[i].project(in_cam)
-            steps = np.rint((pixels + _MARGIN_PX) * _STEPS_PER_PX)
+            steps = np.rint((pixels + _MARGIN_PX) * STEPS_PER_PX)
             u, v = steps.T
             inside = (u >= 0) & (v >= 0) & (u <= self.largest[i, 0]) & (v <= self.largest[i, 1])
         steps[~inside] = self.largest[i] // 2
@@ -172,7 +172,7 @@ class Views:
         for i, camera in enumerate(self._cameras):
             rows = np.flatnonzero((anchors == i) & (depth > 0))
             with np.errstate(all="ignore"):
-                ideal = camera.ideal_from_pixels(pixel[rows] / _STEPS_PER_PX - _MARGIN_PX)
+                ideal = camera.ideal_from_pixels(pixel[rows] / STEPS_PER_PX - _MARGIN_PX)
                 z = np.ldexp(1.0, exponents[rows]) / depth[rows]
                 in_cam = np.column_stack([ideal * z[:, None], z])
                 out[rows] = _moved(self._worlds_from_cams[i], in_cam)
@@ -188,7 +188,7 @@ def steps_of_pixels(observed_px: Array) -> Integers:
     seen = np.isfinite(observed_px)
     if (seen[..., 0] != seen[..., 1]).any():
         raise ValueError("an observation has only one of its two coordinates")
-    steps = np.rint((np.where(seen, observed_px, 0.0) + _MARGIN_PX) * _STEPS_PER_PX)
+    steps = np.rint((np.where(seen, observed_px, 0.0) + _MARGIN_PX) * STEPS_PER_PX)
     if (seen & (steps < 0)).any():
         raise ValueError("an observation lies outside of its image")
     return np.where(seen, steps, -1).astype(np.int64)
@@ -196,7 +196,7 @@ def steps_of_pixels(observed_px: Array) -> Integers:
 
 def pixels_of_steps(steps: Integers) -> Array:
     """Return (..., 2) pixels of steps, NaN where there is none."""
-    return np.where(steps < 0, np.nan, steps / _STEPS_PER_PX - _MARGIN_PX)
+    return np.where(steps < 0, np.nan, steps / STEPS_PER_PX - _MARGIN_PX)
 
 
 def _moved(a_from_b: Pose, points: Array) -> Array:

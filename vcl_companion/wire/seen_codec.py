@@ -9,6 +9,7 @@ import numpy as np
 from vcl_companion.errors import WireError
 from vcl_companion.mapping.seen_landmarks import MAX_ASIDE_PX, MAX_SEEN, SeenLandmarks
 from vcl_companion.wire.landmark_coder import Stream
+from vcl_companion.wire.landmark_grid import STEPS_PER_PX
 from vcl_companion.wire.map_codec import MAX_LANDMARKS, REVISION_BYTES
 from vcl_companion.wire.reader import Reader
 
@@ -18,8 +19,7 @@ from vcl_companion.wire.reader import Reader
 # | 12 | n       | the stream: the flags, then of each landmark seen 2      |
 # |    |         | signed numbers, u and v, steps of 2^-5 px                |
 _HEAD = struct.Struct(f"<{REVISION_BYTES}s2H")
-_STEPS_PER_PX = 1 << 5
-_MAX_STEPS = round(MAX_ASIDE_PX * _STEPS_PER_PX)
+_MAX_STEPS = round(MAX_ASIDE_PX * STEPS_PER_PX)
 
 
 def encode_seen(seen: SeenLandmarks) -> bytes:
@@ -33,7 +33,7 @@ def encode_seen(seen: SeenLandmarks) -> bytes:
         raise ValueError(f"of {n_flags} landmarks some are seen, 1 to {MAX_LANDMARKS} allowed")
     flags = np.zeros(n_flags, dtype=np.int64)
     flags[seen.landmarks] = 1
-    steps = np.rint(seen.aside_px * _STEPS_PER_PX).astype(np.int64)
+    steps = np.rint(seen.aside_px * STEPS_PER_PX).astype(np.int64)
 
     def write(stream: Stream) -> None:
         stream.code_listed(flags)
@@ -58,4 +58,4 @@ def take_seen(reader: Reader) -> SeenLandmarks:
     stream.code_seen(steps)
     if not stream.is_all_read or np.abs(steps).max() > _MAX_STEPS:
         raise WireError("seen landmarks: pixels that nobody tells")
-    return SeenLandmarks(revision, landmarks, steps / _STEPS_PER_PX)
+    return SeenLandmarks(revision, landmarks, steps / STEPS_PER_PX)
