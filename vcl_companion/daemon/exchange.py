@@ -197,7 +197,7 @@ class Exchange:
             options.update.delivery_wait_s,
             len(options.detectors) > 1,
             estimator.carry,
-            lambda: self._rounds.progress != 255,
+            lambda: self._rounds.is_under_way,
         )
         self.inter = InterTarget(
             system_id,

@@ -38,7 +38,7 @@ from vcl_companion.wire.messages import FrameRequest
 _log = logging.getLogger(__name__)
 
 # Percent of an update.
-_GATHERING, _BUILDING = 20, 60
+_GATHERING, _BUILDING, _NO_UPDATE = 20, 60, 255
 _LOOK_S = 0.1
 # A camera that delivers nothing new has nothing for a map either.
 _STALE_NS = 60 * 1_000_000_000
@@ -134,8 +134,13 @@ class MapRounds:
         self._complete_since_s: float | None = None
         self.is_asked = False
         """Whether the ground wants an update: whoever coordinates makes it at once."""
-        self.progress = 255
+        self.progress = _NO_UPDATE
         """How far the update is that is being made, percent; 255: none is."""
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether an update is being made, from its first frame to what is decided of it."""
+        return self.progress != _NO_UPDATE
 
     def take(self, peer: int, frame: FrameAnswer) -> str | None:
         """Take a peer's frame; return why it is refused, if it is."""
@@ -161,7 +166,7 @@ class MapRounds:
                 try:
                     await self._next_revision(stored, frame)
                 finally:
-                    self.progress, self.is_asked = 255, False
+                    self.progress, self.is_asked = _NO_UPDATE, False
                 self._trigger.ended(self._now_s(), from_new_places=self._is_from_new_places)
             else:
                 await asyncio.sleep(_LOOK_S)
