@@ -192,27 +192,31 @@ def scores(errors: PoseErrors, axes_from_ref: Array | None = None) -> Scores | N
     """
     if not len(errors.at_ns):
         return None
-    distance_m = np.linalg.norm(errors.position_ref_m, axis=1)
     aligned_m = None
     if len(errors.at_ns) >= 3:
         moved = rigid_alignment(errors.estimate_ref_m, errors.truth_ref_m)
         left = moved.apply(errors.estimate_ref_m) - errors.truth_ref_m
-        aligned_m = _rms(np.linalg.norm(left, axis=1))
+        aligned_m = position_rms_m(left)
     along = (
         errors.position_ref_m if axes_from_ref is None else errors.position_ref_m @ axes_from_ref.T
     )
     x, y, z = (_rms(along[:, axis]) for axis in range(3))
     known = errors.nees[np.isfinite(errors.nees)]
     return Scores(
-        ate_m=_rms(distance_m),
+        ate_m=position_rms_m(errors.position_ref_m),
         ate_aligned_m=aligned_m,
         rmse_m=(x, y, z),
         yaw_rmse_deg=float(np.degrees(_rms(errors.yaw_rad))),
         within_3_sigma_share=float(np.mean(errors.within_3_sigma)),
         within_3_sigma_or_10cm_share=float(np.mean(errors.within_3_sigma_or_10cm)),
         nees_median=float(np.median(known)) if len(known) else None,
-        worst_m=float(distance_m.max()),
+        worst_m=float(np.linalg.norm(errors.position_ref_m, axis=1).max()),
     )
+
+
+def position_rms_m(errors_m: Array) -> float:
+    """Return the root mean square length of (N, 3) position errors, m; N is at least 1."""
+    return _rms(np.linalg.norm(errors_m, axis=1))
 
 
 def rigid_alignment(moved: Array, fixed: Array) -> Pose:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from sitl.evaluation import position_rms_m
 from sitl.page_style import table
 from sitl.partitions import Partition
 from sitl.result import DroneResult, FlightResult
@@ -101,7 +102,7 @@ def _numbers(drone: DroneResult, from_ns: int, until_ns: int) -> dict[str, Any]:
     errors = drone.errors.position_ref_m
     chosen = (drone.errors.at_ns >= from_ns) & (drone.errors.at_ns < until_ns)
     if chosen.any():
-        out["ate_m"] = float(np.sqrt((errors[chosen] ** 2).sum(axis=1).mean()))
+        out["ate_m"] = position_rms_m(errors[chosen])
     # A step is one of the phase that it leads into: that of the first frame together again too.
     resets = np.diff([counters[at_ns] for at_ns in drone.errors.at_ns.tolist()]) != 0
     steps = np.linalg.norm(np.diff(errors, axis=0), axis=1)
