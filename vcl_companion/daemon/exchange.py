@@ -11,7 +11,6 @@ import asyncio
 import logging
 from collections.abc import Mapping
 from concurrent.futures import Executor
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -29,6 +28,7 @@ from vcl_companion.daemon.map_rounds import MapRounds, RoundOptions
 from vcl_companion.daemon.map_sharing import MapSharing
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.outbox import Outbox
 from vcl_companion.daemon.own_state import OwnState
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.daemon.peer_clocks import PeerClocks
@@ -54,7 +54,6 @@ from vcl_companion.swarm.transfer import (
     Transfers,
 )
 from vcl_companion.swarm.updates import UpdateOptions
-from vcl_companion.swarm.urgency import Message
 from vcl_companion.vision.features import Detector
 from vcl_companion.wire.chunks import Chunk, TransferStatus, describe
 from vcl_companion.wire.frame_codec import decode_frame
@@ -65,7 +64,6 @@ from vcl_companion.wire.tunnel import TunnelPayload, decode_payload, is_ours
 
 _log = logging.getLogger(__name__)
 
-_STEP_S = 0.1
 _SIGNATURE_S = 2.0
 
 
@@ -130,17 +128,22 @@ class Exchange:
         self._estimator = estimator
         self._work = work
         self._options = options
-        self._link: PeerLink | None = None
+        self._outbox = Outbox(transfers)
         self._refusals = Refusals(log)
         self.trust = PeerTrust(group, autopilot, log, self._turn_away, options.quarantine)
         self._n_resets = 0
         self.clocks = PeerClocks(
-            group, self._ask_time, clock, log, self._refusals.count, options.clock_resolution_ns
+            group,
+            self._outbox.ask_time,
+            clock,
+            log,
+            self._refusals.count,
+            options.clock_resolution_ns,
         )
         self._frames = FrameHistory()
         self._passed = PassedFrames(
             group,
-            partial(self._hand, BlobKind.PASSED_FRAME),
+            partial(self._outbox.hand, BlobKind.PASSED_FRAME),
             transfers.cancel,
             work,
             lambda: transfers.shares_network,
@@ -167,7 +170,7 @@ class Exchange:
             maps,
             self._answers.describe,
             self._answers.detail,
-            self._send,
+            self._outbox.send,
             self.decide,
             self._passed,
             transfers.frames_carried_in_s,
@@ -181,7 +184,7 @@ class Exchange:
             rng,
         )
         self._own_state = OwnState(
-            group, maps, estimator, sensor, clock, log, options.update, self._send
+            group, maps, estimator, sensor, clock, log, options.update, self._outbox.send
         )
         self._sharing = MapSharing(
             group,
@@ -205,7 +208,7 @@ class Exchange:
             sensor,
             clock,
             work,
-            partial(self._hand, BlobKind.POSE_REQUEST),
+            partial(self._outbox.hand, BlobKind.POSE_REQUEST),
             transfers.cancel,
             estimator.for_peers,
             transfers.carried_in_s,
@@ -218,7 +221,7 @@ class Exchange:
             maps,
             self._frames,
             estimator,
-            self._send,
+            self._outbox.send,
             self._refusals.count,
             self.trust.why_not,
             clock,
@@ -228,7 +231,6 @@ class Exchange:
             options.detectors,
             tries_all=options.tracked,
         )
-        self._wake = asyncio.Event()
 
     @property
     def refused(self) -> Mapping[str, int]:
@@ -237,8 +239,7 @@ class Exchange:
 
     def attach(self, link: PeerLink) -> None:
         """Give the link to speak on; it calls what begins with ``on``, and ``clocks``."""
-        self._link = link
-        self._transfers.reaches_all_with(link.copies_to_all)
+        self._outbox.attach(link)
 
     def on_frame(self, frame: Frame) -> None:
         """Keep a frame of our own for peers, and for a first map."""
@@ -258,7 +259,7 @@ class Exchange:
             self._malformed(tunnel.sender_system, "payload", error)
             return
         self._accept(tunnel.sender_system, message, to_all=tunnel.target_system == 0)
-        self._wake.set()
+        self._outbox.wake()
 
     async def decide(
         self, built: LandmarkMap | NoMap, instead_of: StoredMap | None, request_id: int
@@ -277,7 +278,7 @@ class Exchange:
             built = refused
         refusal = MapRefused.because(request_id, built.reason)
         for peer in self._group.peers:
-            self._send(refusal, peer)
+            self._outbox.send(refusal, peer)
         self._no_map(built.reason)
 
     async def run(self) -> None:
@@ -299,13 +300,8 @@ class Exchange:
             self._review()
             self._own_state.poll(now_s)
             self._sharing.handing.hand_out(now_s)
-            self._poll_transfers()
-            due_s = self._transfers.next_poll_s()
-            pause_s = _STEP_S if due_s is None else min(max(due_s - now_s, 0.001), _STEP_S)
-            self._wake.clear()
-            with suppress(TimeoutError):
-                async with asyncio.timeout(pause_s):
-                    await self._wake.wait()
+            self._take_events(self._outbox.poll())
+            await self._outbox.pause(now_s)
 
     async def _look_around(self) -> None:
         """Have peers know by a signature, now and then, what place we see."""
@@ -433,17 +429,6 @@ class Exchange:
             _log.warning("no map: %s", reason)
         self._maps.refuse(reason)
 
-    def _hand(self, kind: BlobKind, peer: int, blob: bytes) -> int:
-        self._wake.set()
-        return self._transfers.submit(peer, kind, blob, self._now_s())
-
-    def _poll_transfers(self) -> None:
-        outgoing, events = self._transfers.poll(self._now_s())
-        for payload in outgoing:
-            if self._link is not None:
-                self._link.send(payload.payload_type, payload.payload, payload.peer)
-        self._take_events(events)
-
     def _hand_answer(self, peer: int, blob: bytes) -> tuple[int, ...]:
         """Send a frame to who has asked for it, and to all others where that costs nothing."""
         hears = self._group.trusted_teammates if self._transfers.shares_network else ()
@@ -453,7 +438,7 @@ class Exchange:
             for m in hears
             if m not in (peer, self._system_id) and (is_first or self._group.has_map(m))
         ]
-        return tuple(self._hand(BlobKind.FRAME_ANSWER, to, blob) for to in (peer, *others))
+        return tuple(self._outbox.hand(BlobKind.FRAME_ANSWER, to, blob) for to in (peer, *others))
 
     def want_update(self, wanted: bool) -> None:
         """Want the map updated, or not any more, because the ground does."""
@@ -476,15 +461,6 @@ class Exchange:
     def update_progress(self) -> int:
         """How far the update is that this drone makes, percent; 255 where it makes none."""
         return self._rounds.progress
-
-    def _send(self, message: Message, peer: int) -> None:
-        """Have a message to a peer, or to all (0), go before all that is less urgent."""
-        self._transfers.post(peer, message)
-        self._wake.set()
-
-    def _ask_time(self, ts1_ns: int, peer: int) -> None:
-        if self._link is not None:
-            self._link.ask_time(ts1_ns, peer)
 
     def _note(self, events: list[PeerJoined | PeerLost]) -> None:
         for event in events:
