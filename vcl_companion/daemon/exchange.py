@@ -1,8 +1,9 @@
 """What peers say, and what is said to them: frames and votes for maps, maps, and poses.
 
-What comes from peers enters here only, bounded and checked by ``wire`` and
-``swarm``; it can replace the map, propose a pose, and nothing else. Nothing is done for a peer
-while its payload is taken in: what it asks for waits in a mailbox of its own.
+What comes from peers enters here only (``peer_messages``, ``deliveries``), bounded and checked by
+``wire`` and ``swarm``; it can replace the map, propose a pose, and nothing else. Nothing is done
+for a peer while its payload is taken in: what it asks for waits in a mailbox of its own. What is
+said leaves by the ``outbox``. Here these are joined, and kept going.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
+from vcl_companion.daemon.deliveries import Deliveries
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_answers import FrameAnswers
@@ -32,35 +34,23 @@ from vcl_companion.daemon.outbox import Outbox
 from vcl_companion.daemon.own_state import OwnState
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.daemon.peer_clocks import PeerClocks
+from vcl_companion.daemon.peer_messages import PeerMessages
+from vcl_companion.daemon.peer_presence import PeerPresence
 from vcl_companion.daemon.peer_trust import PeerTrust
 from vcl_companion.daemon.refusals import Refusals
-from vcl_companion.errors import WireError
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.messages import Tunnel
 from vcl_companion.links.peers import PeerLink
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.recording.sensor import Sensor
-from vcl_companion.swarm.group import Group, PeerJoined, PeerLost, SwarmOptions
+from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
-from vcl_companion.swarm.quarantine import Evidence, QuarantineOptions
-from vcl_companion.swarm.transfer import (
-    BlobDelivered,
-    BlobHeld,
-    BlobKind,
-    BlobReceived,
-    Event,
-    TransferFailed,
-    Transfers,
-)
+from vcl_companion.swarm.quarantine import QuarantineOptions
+from vcl_companion.swarm.transfer import BlobKind, Transfers
 from vcl_companion.swarm.updates import UpdateOptions
 from vcl_companion.vision.features import Detector
-from vcl_companion.wire.chunks import Chunk, TransferStatus, describe
-from vcl_companion.wire.frame_codec import decode_frame
-from vcl_companion.wire.header import VersionMismatchError
-from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
-from vcl_companion.wire.pose_messages import PoseProposal, PoseRefused
-from vcl_companion.wire.tunnel import TunnelPayload, decode_payload, is_ours
+from vcl_companion.wire.messages import MapRefused
 
 _log = logging.getLogger(__name__)
 
@@ -130,7 +120,9 @@ class Exchange:
         self._options = options
         self._outbox = Outbox(transfers)
         self._refusals = Refusals(log)
-        self.trust = PeerTrust(group, autopilot, log, self._turn_away, options.quarantine)
+        self.trust = PeerTrust(
+            group, autopilot, log, self._refusals, self._turn_away, options.quarantine
+        )
         self._n_resets = 0
         self.clocks = PeerClocks(
             group,
@@ -231,6 +223,36 @@ class Exchange:
             options.detectors,
             tries_all=options.tracked,
         )
+        self._presence = PeerPresence(
+            group,
+            self._sharing.handing,
+            self._passed,
+            self.clocks,
+            self._own_state,
+            self.inter,
+            log,
+        )
+        self._deliveries = Deliveries(
+            group,
+            self._rounds,
+            self._passed,
+            self._sharing,
+            self._inter_host,
+            self.trust,
+            self._refusals,
+            log,
+        )
+        self._messages = PeerMessages(
+            group,
+            transfers,
+            self._deliveries,
+            self._presence,
+            self._answers,
+            maps,
+            self.inter,
+            self.trust,
+            self._refusals,
+        )
 
     @property
     def refused(self) -> Mapping[str, int]:
@@ -247,19 +269,12 @@ class Exchange:
 
     def on_heartbeat(self, peer: int) -> None:
         """Note a sign of life."""
-        self._note(self._group.heartbeat(peer, self._now_s()))
+        self._presence.heartbeat(peer)
 
     def on_tunnel(self, tunnel: Tunnel) -> None:
         """Take one payload of a peer; whatever is wrong with it is counted, never raised."""
-        if not is_ours(tunnel.payload_type):
-            return
-        try:
-            message = decode_payload(tunnel.payload_type, tunnel.payload)
-        except WireError as error:
-            self._malformed(tunnel.sender_system, "payload", error)
-            return
-        self._accept(tunnel.sender_system, message, to_all=tunnel.target_system == 0)
-        self._outbox.wake()
+        if self._messages.take(tunnel):
+            self._outbox.wake()
 
     async def decide(
         self, built: LandmarkMap | NoMap, instead_of: StoredMap | None, request_id: int
@@ -296,11 +311,11 @@ class Exchange:
     async def _keep_going(self) -> None:
         while True:
             now_s = self._now_s()
-            self._note(self._group.poll(now_s))
+            self._presence.poll(now_s)
             self._review()
             self._own_state.poll(now_s)
             self._sharing.handing.hand_out(now_s)
-            self._take_events(self._outbox.poll())
+            self._deliveries.take(self._outbox.poll())
             await self._outbox.pause(now_s)
 
     async def _look_around(self) -> None:
@@ -315,68 +330,6 @@ class Exchange:
             signature = await self._work.signature(np.asarray(newest.image))
             self._group.note_signature(signature, self._now_s())
 
-    def _accept(self, peer: int, message: TunnelPayload, *, to_all: bool) -> None:
-        now_s = self._now_s()
-        if not isinstance(message, Chunk | TransferStatus):
-            self.trust.heard(peer)
-            if not isinstance(message, MapState) and self._is_barred(peer, "message"):
-                return
-        match message:
-            case Chunk() | TransferStatus():
-                self._take_events(self._transfers.receive(peer, message, now_s, to_all=to_all))
-            case MapState():
-                before = self._group.state_of(peer)
-                if before is not None and before.revision and not message.revision:
-                    self._forgot(peer)
-                self._note(self._group.map_state(peer, message, now_s))
-            case FrameRequest():
-                self._answers.want(peer, message)
-            case MapRefused():
-                if peer == self._group.coordinator:
-                    self._maps.refuse(message.reason)
-            case PoseProposal() | PoseRefused():
-                refusal = self.inter.take(peer, message)
-                if refusal is not None:
-                    self._refusals.count(peer, refusal)
-
-    def _take_events(self, events: list[Event]) -> None:
-        for event in events:
-            match event:
-                case BlobReceived(peer=peer, kind=BlobKind.FRAME_ANSWER, blob=blob):
-                    self._take_frame(peer, blob)
-                case BlobReceived(
-                    peer=peer,
-                    kind=(BlobKind.MAP | BlobKind.MAP_UPDATE | BlobKind.MAP_PART) as kind,
-                    blob=blob,
-                ):
-                    self._sharing.offer(peer, kind, blob)
-                case BlobReceived(peer=peer, kind=BlobKind.POSE_REQUEST, blob=blob):
-                    self._inter_host.offer(peer, blob)
-                case BlobReceived(peer=peer, kind=BlobKind.PASSED_FRAME, blob=blob):
-                    self._take_passed(peer, blob)
-                case BlobHeld(peer=peer, digest=digest):
-                    self._passed.is_held(peer, digest)
-                case BlobDelivered(peer=peer, transfer_id=transfer_id):
-                    self._passed.ended(peer, transfer_id, delivered=True)
-                    self._sharing.handing.delivered(peer, transfer_id, self._now_s())
-                case TransferFailed(peer=peer, transfer_id=transfer_id, reason=reason):
-                    self._passed.ended(peer, transfer_id, delivered=False)
-                    self._log.event("transfer", f"to drone {peer}: {reason}")
-                    _log.warning("transfer to drone %d failed: %s", peer, reason)
-
-    def _is_barred(self, peer: int, kind: str) -> bool:
-        """Whether something is not taken because of who says it; that is counted."""
-        if not self.trust.why_not(peer):
-            return False
-        self._refusals.count(peer, f"{kind} of a quarantined drone")
-        return True
-
-    def _malformed(self, peer: int, kind: str, error: WireError) -> None:
-        """Count bytes that no drone sends; another version's are only not understood."""
-        self._refusals.count(peer, kind, str(error))
-        if not isinstance(error, VersionMismatchError):
-            self.trust.note(peer, Evidence.MALFORMED, f"{kind}: {error}")
-
     def _review(self) -> None:
         """Let who was quarantined go when it is time, and poses that ours has come round to."""
         if self._estimator.n_resets != self._n_resets:
@@ -387,36 +340,6 @@ class Exchange:
     def _turn_away(self, peer: int) -> None:
         """Wait for nothing of a peer that is not believed any more."""
         self.inter.lost(peer)
-
-    def _take_frame(self, peer: int, blob: bytes) -> None:
-        if self._is_barred(peer, "frame"):
-            return
-        try:
-            frame = decode_frame(blob)
-        except WireError as error:
-            self._malformed(peer, "frame", error)
-            return
-        if frame.drone_id == peer and not self._group.is_coordinator:
-            self._passed.hold(frame)
-            return
-        refusal = self._rounds.take(peer, frame)
-        if refusal is not None:
-            self._refusals.count(peer, refusal)
-            return
-        self._passed.answered(frame, describe(BlobKind.FRAME_ANSWER, blob).short_digest)
-
-    def _take_passed(self, peer: int, blob: bytes) -> None:
-        if self._is_barred(peer, "frame"):
-            return
-        try:
-            self._passed.take(peer, blob)
-        except WireError as error:
-            self._refusals.count(peer, "passed frame", str(error))
-
-    def _forgot(self, peer: int) -> None:
-        """Note that a peer may have lost what it was sent: it was restarted, or away."""
-        self._sharing.handing.forgot(peer)
-        self._passed.forgot(peer)
 
     def _no_map(self, reason: str) -> None:
         """Note that a round gave no map; the one in use stays, if there is one."""
@@ -461,19 +384,6 @@ class Exchange:
     def update_progress(self) -> int:
         """How far the update is that this drone makes, percent; 255 where it makes none."""
         return self._rounds.progress
-
-    def _note(self, events: list[PeerJoined | PeerLost]) -> None:
-        for event in events:
-            joined = isinstance(event, PeerJoined)
-            self._log.event("peer", f"drone {event.peer} {'joined' if joined else 'lost'}")
-            _log.info("drone %d %s", event.peer, "joined" if joined else "is silent")
-            if joined:
-                self._forgot(event.peer)
-                self.clocks.joined(event.peer)
-                self._own_state.joined()
-            else:
-                self._passed.forgot(event.peer)
-                self.inter.lost(event.peer)
 
     def _now_s(self) -> float:
         return asyncio.get_running_loop().time()

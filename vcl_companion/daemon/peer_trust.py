@@ -2,7 +2,7 @@
 
 A quarantined drone is still heard, and handed maps: it may be right again. What it says
 of poses and maps, its frames, its requests and its vote count for nothing until its term
-is over (``swarm/quarantine.py``).
+is over (``swarm/quarantine.py``). That is counted (``bars``), as is what no drone would send.
 """
 
 from __future__ import annotations
@@ -12,11 +12,14 @@ import logging
 from collections.abc import Callable, Mapping
 
 from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.refusals import Refusals
+from vcl_companion.errors import WireError
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.messages import STATUS_TEXT_BYTES
 from vcl_companion.links.texts import Severity
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.quarantine import Evidence, Quarantine, Quarantined, QuarantineOptions
+from vcl_companion.wire.header import VersionMismatchError
 
 _log = logging.getLogger(__name__)
 
@@ -31,6 +34,7 @@ class PeerTrust:
         group: told whose votes do not count.
         autopilot: told of every change, for the ground.
         log: likewise.
+        refusals: counts what is not taken.
         turned_away: told whose answers nobody waits for any more.
         options: thresholds and terms.
     """
@@ -40,12 +44,14 @@ class PeerTrust:
         group: Group,
         autopilot: AutopilotLink,
         log: FlightLog,
+        refusals: Refusals,
         turned_away: Callable[[int], None],
         options: QuarantineOptions,
     ) -> None:
         self._group = group
         self._autopilot = autopilot
         self._log = log
+        self._refusals = refusals
         self._turned_away = turned_away
         self._quarantine = Quarantine(options)
         self._unsaid: dict[int, tuple[Severity, str]] = {}
@@ -60,6 +66,19 @@ class PeerTrust:
         """Return why a peer is not believed now; empty if it is."""
         why = self._quarantine.why(peer)
         return f"quarantined: {why}" if why else ""
+
+    def bars(self, peer: int, kind: str) -> bool:
+        """Whether something is not taken because of who says it; that is counted."""
+        if not self.why_not(peer):
+            return False
+        self._refusals.count(peer, f"{kind} of a quarantined drone")
+        return True
+
+    def malformed(self, peer: int, kind: str, error: WireError) -> None:
+        """Count bytes that no drone sends; another version's are only not understood."""
+        self._refusals.count(peer, kind, str(error))
+        if not isinstance(error, VersionMismatchError):
+            self.note(peer, Evidence.MALFORMED, f"{kind}: {error}")
 
     def note(self, peer: int, evidence: Evidence, why: str = "") -> None:
         """Take what speaks against a peer, or for it."""
