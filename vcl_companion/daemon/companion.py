@@ -6,19 +6,19 @@ import asyncio
 import logging
 import math
 import weakref
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-
-import numpy as np
 
 from vcl_companion.cameras.source import CameraSource, Frame
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import Basis, FlightLog, PoseSource
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
+from vcl_companion.daemon.frame_waits import FrameWaits
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.inter_target import Asked, InterTarget
 from vcl_companion.daemon.mailbox import FramesBehind, Mailbox
+from vcl_companion.daemon.map_search import MapSearch, Sought
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.teller import Teller
@@ -36,33 +36,11 @@ _log = logging.getLogger(__name__)
 ATTITUDE_WAIT_S = 0.1
 # How long the last frames of a stream may take.
 _LAST_FRAMES_S = 5.0
-# How often features are asked about a pose that few patches agree on, and how often a second
-# detector looks for a drone that is lost: it takes as long as ten frames.
+# How often features are asked about a pose that few patches agree on.
 _DOUBT_EVERY_S = 5.0
-_FALL_BACK_EVERY_S = 1.0
-# A search in vain that took longer than frames are apart is not begun again before so many
-# times as long: on a small board the map that it needs would else never be made.
-_PAUSE_AFTER_VAIN = 1.0
 _PATCHES_ALONE = Effort(may_search=False, may_doubt=False)
 # A third of a megabyte each.
 _MAX_BEHIND = 16
-
-
-@dataclass(frozen=True, eq=False)
-class _Sought:
-    """A frame that features are asked about, because patches gave no pose.
-
-    Attributes:
-        frame: which.
-        ned_from_body: (3, 3) its attitude, or None.
-        stored: the map that is searched.
-        may_fall_back: whether by all detectors.
-    """
-
-    frame: Frame
-    ned_from_body: Array | None
-    stored: StoredMap
-    may_fall_back: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,18 +117,11 @@ class Companion:
         self._health = health
         self._log = log
         self._executor = executor
-        self._work = work
         self._options = options
-        self._frame_wait_s = frame_wait_s
         self._mailbox = Mailbox()
-        self._over = asyncio.Event()
-        # Maps that may have been left since, which are not to be kept in memory for that.
-        self._vain: weakref.ref[StoredMap] | None = None
-        self._searched: weakref.ref[StoredMap] | None = None
-        self._doubted_at_s = self._fell_back_at_s = self._search_again_at_s = -math.inf
-        self._search_over = asyncio.Event()
-        self._search_over.set()
-        self._sought_at_ns = -1
+        self._waits = FrameWaits(self._mailbox, maps, health, frame_wait_s)
+        self._map_search = MapSearch(self._mailbox, maps, estimator, work)
+        self._doubted_at_s = -math.inf
         self._behind: FramesBehind[NotLocalized] = FramesBehind(_MAX_BEHIND)
 
     async def read_camera(self) -> None:
@@ -167,7 +138,7 @@ class Companion:
                 self._drop(replaced)
             self._on_frame(frame)
         _log.info("the camera's stream is over")
-        self._over.set()
+        self._waits.stream_is_over()
         await self._outcomes.all_answered(_LAST_FRAMES_S)
 
     async def run(self) -> None:
@@ -189,53 +160,12 @@ class Companion:
 
     async def _first_map(self, frame: Frame) -> StoredMap | None:
         """Wait for a first map as long as no newer frame comes; answer the frame if none does."""
-        with self._health.waiting_for_map():
-            await self._unless_newer(frame, self._maps.decided())
+        await self._waits.first_map(frame)
         if self._maps.current is None:
-            self._outcomes.refuse(frame, self._no_map())
+            self._outcomes.refuse(frame, self._waits.no_map())
         return self._maps.current
 
-    async def _next_map(self, frame: Frame, stored: StoredMap | None) -> StoredMap | None:
-        """Wait for a map that may know a place which this one does not, while no frame comes.
-
-        A frame that is not recognised shows where the map has a gap, and is among those that
-        fill it. Where none came in time for one frame the next ones do not wait.
-
-        Args:
-            frame: which.
-            stored: the map that does not know it; None for one that has been left since.
-        """
-        if stored is None or self._maps.current is not stored:
-            return self._maps.current
-        if not _is(self._vain, stored):
-            with self._health.waiting_for_map():
-                await self._unless_newer(frame, self._maps.newer_than(stored), self._frame_wait_s)
-            if self._maps.current is stored and not self._mailbox.has_had_newer(frame):
-                self._vain = weakref.ref(stored)
-        return None if self._maps.current is stored else self._maps.current
-
-    async def _unless_newer(
-        self,
-        frame: Frame,
-        awaited: Coroutine[None, None, object],
-        within_s: float | None = None,
-    ) -> None:
-        """Wait for something, until a newer frame comes or the stream is over."""
-        waiting = [
-            asyncio.ensure_future(one)
-            for one in (awaited, self._mailbox.newer_than(frame), self._over.wait())
-        ]
-        try:
-            await asyncio.wait(waiting, timeout=within_s, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for one in waiting:
-                one.cancel()
-
-    def _no_map(self) -> NotLocalized:
-        ended = "the camera's stream is over" if self._over.is_set() else "none yet"
-        return NotLocalized(f"no map: {self._maps.refusal or ended}")
-
-    async def _localize(self, frame: Frame, stored: StoredMap) -> _Sought | _AskedPeers | None:
+    async def _localize(self, frame: Frame, stored: StoredMap) -> Sought | _AskedPeers | None:
         """Localize a frame by the map, and answer it unless features or peers are asked as well.
 
         Returns:
@@ -253,18 +183,14 @@ class Companion:
         if isinstance(fix, Localized) or not follows:
             self._estimator.seen_on = stored.revision
         if isinstance(fix, NotLocalized) and follows:
-            if self._is_searching:
+            search = self._map_search
+            if search.is_under_way:
                 # What is found there leads this frame too, if it is still the newest then.
-                await self._unless_newer(frame, self._search_over.wait())
-                if not (self._is_searching or self._mailbox.has_had_newer(frame)):
+                await self._waits.unless_newer(frame, search.ended())
+                if not (search.is_under_way or self._mailbox.has_had_newer(frame)):
                     return await self._localize(frame, self._maps.current or stored)
-            elif not _is(self._searched, stored) or now_s >= self._search_again_at_s:
-                self._search_over.clear()
-                if not _is(self._searched, stored):
-                    self._estimator.sought_since_s = asyncio.get_running_loop().time()
-                self._sought_at_ns = frame.captured_at_ns
-                may_fall_back = now_s >= self._fell_back_at_s + _FALL_BACK_EVERY_S
-                return _Sought(frame, ned_from_body, stored, may_fall_back)
+            elif search.is_due(stored, now_s):
+                return search.begin(frame, ned_from_body, stored, now_s)
         return await self._ask(frame, ned_from_body, stored, refused)
 
     async def _attitude_of(self, frame: Frame) -> Array | None:
@@ -290,59 +216,23 @@ class Companion:
             replace(effort, has_heading=self._estimator.has_heading),
         )
 
-    @property
-    def _is_searching(self) -> bool:
-        return not self._search_over.is_set()
-
-    def _is_behind(self, frame: Frame) -> bool:
-        """Whether a frame is later than one that is searched for."""
-        return self._is_searching and frame.captured_at_ns > self._sought_at_ns
-
-    async def _search(self, sought: _Sought) -> _AskedPeers | _Sought | None:
+    async def _search(self, sought: Sought) -> _AskedPeers | Sought | None:
         """Look for a frame by its features; the rest is as for any other.
 
         What comes meanwhile is kept, and followed from where this one is found.
         """
         frame = sought.frame
         try:
-            stored, fix = await self._found(sought)
+            stored, fix = await self._map_search.found(sought)
             refused = self._take(frame, fix, sought.ned_from_body)
             self._estimator.seen_on = stored.revision
             while refused is None and (behind := self._behind.take()) is not None:
                 await self._look_again(*behind)
         finally:
-            self._search_over.set()
-            self._estimator.sought_since_s = None
+            self._map_search.end()
             while (behind := self._behind.take()) is not None:
                 self._give_up(*behind)
         return await self._ask(frame, sought.ned_from_body, stored, refused)
-
-    async def _found(self, sought: _Sought) -> tuple[StoredMap, Localized | NotLocalized]:
-        """Return what the features of a frame say, and of which map: of a newer one if that came.
-
-        A map that was made because the last one ended here comes while that is searched in vain.
-        """
-        frame, stored = sought.frame, sought.stored
-        effort = Effort(
-            may_track=False,
-            may_fall_back=sought.may_fall_back,
-            has_heading=self._estimator.has_heading,
-        )
-        while True:
-            began_s = asyncio.get_running_loop().time()
-            predicted = self._estimator.predicted(frame.captured_at_ns, sought.ned_from_body)
-            prior = predicted.prior() if predicted else None
-            fix = await self._work.find(
-                np.asarray(frame.image), stored, prior, sought.ned_from_body, effort
-            )
-            if isinstance(fix, Localized):
-                return stored, fix
-            self._searched_in_vain(frame, stored, began_s)
-            if sought.may_fall_back and stored.index.fallback is not None:
-                self._fell_back_at_s = began_s
-            if self._maps.current is None or self._maps.current is stored:
-                return stored, fix
-            stored = self._maps.current
 
     async def _look_again(self, frame: Frame, refused: NotLocalized) -> None:
         """Answer a frame by what is known by now of where it was taken: later ones have been."""
@@ -361,7 +251,7 @@ class Companion:
         ned_from_body: Array | None,
         stored: StoredMap,
         refused: NotLocalized | None,
-    ) -> _Sought | _AskedPeers | None:
+    ) -> Sought | _AskedPeers | None:
         """Answer a frame that has been looked at, unless peers are asked about it.
 
         Nor are they while the search of an older frame, which will lead this one, has only begun.
@@ -369,7 +259,7 @@ class Companion:
         sigma_m = math.inf if refused else self._estimator.sigma_m
         now_s = asyncio.get_running_loop().time()
         is_sought = self._estimator.is_being_sought(now_s)
-        is_led = refused is not None and self._is_behind(frame) and is_sought
+        is_led = refused is not None and self._map_search.is_behind(frame) and is_sought
         asked = None
         if not is_led:
             asked = self._inter.begin(frame, ned_from_body, stored.revision, sigma_m)
@@ -381,27 +271,19 @@ class Companion:
             return None
         return await self._given_up(frame, stored, refused)
 
-    def _searched_in_vain(self, frame: Frame, stored: StoredMap, began_at_s: float) -> None:
-        """Note a search that found nothing, and whether it took longer than frames are apart."""
-        ended_at_s = asyncio.get_running_loop().time()
-        self._searched = weakref.ref(stored)
-        self._maps.want_more()
-        if self._mailbox.has_had_newer(frame):
-            self._search_again_at_s = ended_at_s + _PAUSE_AFTER_VAIN * (ended_at_s - began_at_s)
-
     async def _given_up(
         self, frame: Frame, stored: StoredMap | None, refused: NotLocalized
-    ) -> _Sought | _AskedPeers | None:
+    ) -> Sought | _AskedPeers | None:
         """Answer a frame that nobody could place, unless something comes that may place it.
 
         That is a newer map, or, where an older frame is still looked for, its place.
         """
-        if self._is_behind(frame):
+        if self._map_search.is_behind(frame):
             for let_go in self._behind.keep(frame, refused):
                 self._give_up(*let_go)
             return None
         self._health.refused(refused.reason)
-        newer = await self._next_map(frame, stored)
+        newer = await self._waits.next_map(frame, stored)
         if newer is not None:
             return await self._localize(frame, newer)
         if self._mailbox.has_had_newer(frame):
@@ -433,9 +315,9 @@ class Companion:
             return state
         return self._send(frame, state, "intra", fix.by, fix.n_matched, fix.n_inliers)
 
-    async def _finish(self, left: _Sought | _AskedPeers | None) -> None:
+    async def _finish(self, left: Sought | _AskedPeers | None) -> None:
         """Do what is left to do for a frame, beside the frames that follow it."""
-        while isinstance(left, _Sought):
+        while isinstance(left, Sought):
             left = await self._search(left)
         if left is not None:
             await self._hear_peers(left)
@@ -509,11 +391,6 @@ class Companion:
     def _drop(self, frame: Frame) -> None:
         """Answer a frame whose place a newer one took before it was looked at."""
         if self._maps.current is None:
-            self._outcomes.refuse(frame, self._no_map())
+            self._outcomes.refuse(frame, self._waits.no_map())
         else:
             self._outcomes.drop(frame)
-
-
-def _is(noted: weakref.ref[StoredMap] | None, stored: StoredMap) -> bool:
-    """Whether a map is the one that was noted."""
-    return noted is not None and noted() is stored
