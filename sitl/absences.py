@@ -117,6 +117,10 @@ def check_times(
         last_s = time.from_s if math.isinf(time.until_s) else time.until_s
         if last_s >= duration_s:
             raise ConfigError(f"{time}: the flight is over after {duration_s:.1f} s")
+    for one, next_one in itertools.pairwise(sorted(times, key=lambda t: (t.drone, t.from_s))):
+        if one.drone == next_one.drone and next_one.from_s <= one.until_s:
+            does = "runs" if isinstance(next_one, Absence) else "sees anything"
+            raise ConfigError(f"{next_one}: no longer {does} then, by {one}")
 
 
 def check_absences(absences: Sequence[Absence], names: Sequence[str], duration_s: float) -> None:
@@ -128,10 +132,6 @@ def check_absences(absences: Sequence[Absence], names: Sequence[str], duration_s
         duration_s: of the flight.
     """
     check_times(absences, names, duration_s)
-    ordered = sorted(absences, key=lambda absence: (absence.drone, absence.from_s))
-    for one, next_one in itertools.pairwise(ordered):
-        if one.drone == next_one.drone and next_one.from_s <= one.until_s:
-            raise ConfigError(f"{next_one}: is not running then, by {one}")
     if {absence.drone for absence in absences if absence.from_s == 0.0} >= set(names):
         raise ConfigError("--late: nobody is there from the start")
 

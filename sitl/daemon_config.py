@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sitl.plan import FlightPlan, PlannedDrone, Setting
+from vcl_companion.config import parse_config
 from vcl_companion.errors import ConfigError
 from vcl_companion.recording.recording import CAMERA_FOLDER
 
@@ -74,6 +75,18 @@ def daemon_config(
         # Frames as fast as they can be looked at would leave maps no time at all.
         wiring["scheduling"] = "normal"
     return with_settings(wiring, plan.options.settings)
+
+
+def check_settings(plan: FlightPlan) -> None:
+    """Refuse what no daemon would start with, before anything is written for one.
+
+    Raises:
+        ConfigError: a setting, or a known distance, is no valid configuration.
+    """
+    for planned in plan.drones:
+        others = range(2, 1 + len(plan.drones))
+        config = daemon_config(plan, planned, Path("out"), 1, 1, 1, others)
+        parse_config(toml_text(config), "--set" if plan.options.settings else planned.name)
 
 
 def key_path(out: Path) -> Path:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from sitl.daemon_config import check_settings
 from sitl.out_folder import prepare_folder
 from sitl.pacing import Instant, Pace, gate, instants
 from sitl.plan import FlightPlan, FlyOptions, plan_flight
@@ -62,6 +63,7 @@ def fly(recording_path: Path, out: Path, options: FlyOptions, progress: Progress
     """
     progress("reading the recording", 0, 0)
     plan = plan_flight(read_recording(recording_path), options)
+    check_settings(plan)
     prepare_folder(out, plan)
     return reported(plan, out, flown(plan, out, RecordedShots(), progress), progress)
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sitl.daemon_config import check_settings
 from sitl.fly import Progress, flown, reported
 from sitl.out_folder import RECORDING_FOLDER, prepare_folder
 from sitl.pacing import Instant
@@ -65,6 +66,7 @@ def fly_live(
         KeyboardInterrupt: likewise, on Ctrl-C.
     """
     plan = plan_live(scenario, out, options)
+    check_settings(plan)
     stored = None if map_of is None else _last_map(map_of)
     prepare_folder(out, plan)
     for planned in plan.drones:

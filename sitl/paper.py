@@ -19,7 +19,9 @@ from typing import Any
 
 import msgspec
 
+from sitl.daemon_config import check_settings
 from sitl.default_goals import default_goals
+from sitl.embedded import DEMO
 from sitl.fly import Progress
 from sitl.goals import Goal
 from sitl.paper_experiments import (
@@ -36,11 +38,12 @@ from sitl.paper_goals import goals
 from sitl.paper_measures import compared, flight_measures
 from sitl.paper_page import page
 from sitl.paper_recordings import Rendered, rendered
-from sitl.plan import FlyOptions, Setting
+from sitl.plan import FlyOptions, Setting, plan_flight
 from sitl.processes import FlightError
 from sitl.report import rounded
 from sitl.scenario import Scenario, load_scenario
 from vcl_companion.errors import ConfigError
+from vcl_companion.recording import read_recording
 
 Say = Callable[[str], None]
 
@@ -111,6 +114,7 @@ def make_paper(
         KeyboardInterrupt: on Ctrl-C; what is finished stays.
     """
     asked = chosen(experiments, options.only)
+    _check(asked, pipelines, options)
     scenarios = {e.name: _cut(load_scenario(e.scenario), options.seconds) for e in asked}
     result = PaperResult(asked, scenarios, whole=options.seconds is None)
     recordings = options.recordings or out / "recordings"
@@ -165,11 +169,7 @@ def _fly(
     name = f"{experiment.name}, {pipeline.name}, {variant_name(fused)}"
     folder = out / "flights" / _label(experiment, options)
     folder = folder / f"{pipeline.name}-{variant_name(fused)}"
-    fly_options = FlyOptions(
-        speed=options.speed or pipeline.speed,
-        start_timeout_s=options.start_timeout_s,
-        settings=settings_of(experiment, pipeline, fused, options.settings),
-    )
+    fly_options = _fly_options(experiment, pipeline, options, fused=fused)
     try:
         flight = flown(
             experiment, pipeline, fused, recording, folder, fly_options,
@@ -184,6 +184,31 @@ def _fly(
         say(f"{name}: flight reused, {folder}")
     else:
         say(f"{name}: flown{f' again, {flight.why}' if flight.why else ''}, {folder}")
+
+
+def _fly_options(
+    experiment: Experiment, pipeline: Pipeline, options: PaperOptions, *, fused: bool
+) -> FlyOptions:
+    return FlyOptions(
+        speed=options.speed or pipeline.speed,
+        start_timeout_s=options.start_timeout_s,
+        settings=settings_of(experiment, pipeline, fused, options.settings),
+    )
+
+
+def _check(
+    experiments: Sequence[Experiment], pipelines: Sequence[Pipeline], options: PaperOptions
+) -> None:
+    """Refuse settings that no daemon would start with, before hours are spent on them.
+
+    The recordings are yet to be rendered: a flight of the demo's would refuse the same.
+    """
+    demo = read_recording(DEMO)
+    for experiment in experiments:
+        for pipeline in pipelines:
+            for fused in experiment.variants():
+                fly_options = _fly_options(experiment, pipeline, options, fused=fused)
+                check_settings(plan_flight(demo, fly_options))
 
 
 def _label(experiment: Experiment, options: PaperOptions) -> str:

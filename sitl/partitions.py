@@ -68,11 +68,23 @@ def parse_partition(text: str) -> Partition:
     raise ConfigError(f"--partition {text}: expected FROM-UNTIL:GROUP|GROUP, {_LIKE}")
 
 
-def check_flying(partitions: Sequence[Partition], names: Sequence[str]) -> None:
-    """Raise ConfigError when a partition names somebody who does not fly."""
+def check_partitions(
+    partitions: Sequence[Partition], names: Sequence[str], duration_s: float
+) -> None:
+    """Raise ConfigError when a partition names who does not fly, or begins after the flight.
+
+    Args:
+        partitions: all of them.
+        names: who flies.
+        duration_s: of the flight.
+    """
     for partition in partitions:
         for name in sorted(partition.names - set(names)):
             raise ConfigError(f"--partition: {name!r} does not fly ({', '.join(names)})")
+        if partition.from_s >= duration_s:
+            raise ConfigError(
+                f"--partition {partition}: the flight is over after {duration_s:.1f} s"
+            )
 
 
 def _group(text: str) -> frozenset[str]:

@@ -16,7 +16,7 @@ from sitl.absences import Absence, Blindness, check_absences, check_times
 from sitl.firmware import FirmwareBinary
 from sitl.mission import Mission
 from sitl.network import NetworkOptions
-from sitl.partitions import check_flying
+from sitl.partitions import check_partitions
 from vcl_companion.config import Config
 from vcl_companion.errors import ConfigError
 from vcl_companion.recording import Drone, KnownPair, Recording
@@ -197,13 +197,14 @@ def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:
     for name in options.drones:
         if name not in names:
             raise ConfigError(f"--drones: {recording.path} has no {name!r} ({', '.join(names)})")
+        if options.drones.count(name) > 1:
+            raise ConfigError(f"--drones: {name} is given twice")
     flying = [name for name in names if not options.drones or name in options.drones]
     drones = tuple(
         PlannedDrone(drone, n + 1, _attitude_path(drone, options))
         for n, drone in enumerate(recording.drones)
         if drone.name in flying
     )
-    check_flying(options.network.partitions, flying)
     pairs = _known_pairs(recording, drones, options.known_distances)
     plan = FlightPlan(
         recording=recording,
@@ -214,6 +215,7 @@ def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:
         options=options,
     )
     duration_s = (plan.ends_at_ns - plan.starts_at_ns) * 1e-9
+    check_partitions(options.network.partitions, flying, duration_s)
     check_absences(options.absences, flying, duration_s)
     check_times(options.blind, flying, duration_s)
     return plan
@@ -244,6 +246,8 @@ def _known_pairs(
         for name in (pair.a, pair.b):
             if name not in names:
                 raise ConfigError(f"--known-distance: {name!r} does not fly ({', '.join(names)})")
+        if sum({pair.a, pair.b} == {other.a, other.b} for other in given) > 1:
+            raise ConfigError(f"--known-distance {pair.a}:{pair.b}: is given twice")
     pairs = given or [p for p in recording.known_distances if {p.a, p.b} <= set(names)]
     if not pairs and len(drones) > 1:
         raise ConfigError(

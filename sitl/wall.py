@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 
+from sitl.embedded import DEMO
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
@@ -30,12 +30,11 @@ _WALL_M = 8.0
 _MOST_OFF_PX = 40
 _QUALITY = 30
 _MOST_LANDMARKS = 60
-_DEMO = Path(__file__).parent / "recordings" / "demo"
 
 
 @functools.cache
 def _pictures() -> tuple[Image, ...]:
-    files = [_DEMO / f"mav{k}" / "cam0" / "data" / "1760000000000000000.jpg" for k in range(3)]
+    files = [DEMO / f"mav{k}" / "cam0" / "data" / "1760000000000000000.jpg" for k in range(3)]
     images = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]
     return tuple(np.asarray(image, dtype=np.uint8) for image in images if image is not None)
 

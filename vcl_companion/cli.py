@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -205,6 +206,13 @@ def ground() -> None:
     """Ask drones for things from the ground, over their telemetry."""
 
 
+def _a_number(_context: click.Context, _option: click.Parameter, value: float) -> float:
+    """Refuse NaN, which lies in every range as it lies outside of none."""
+    if math.isnan(value):
+        raise click.BadParameter("nan is no number of seconds")
+    return value
+
+
 def _to_drones(within_s: float) -> Callable[[_Function], _Function]:
     """Return the options of an order: to which drones it goes, and how long they have."""
     options = (
@@ -233,6 +241,7 @@ def _to_drones(within_s: float) -> Callable[[_Function], _Function]:
             show_default=True,
             metavar="S",
             type=click.FloatRange(1.0, 3600.0),
+            callback=_a_number,
             help="How long they have.",
         ),
     )

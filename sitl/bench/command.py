@@ -20,6 +20,7 @@ from sitl.bench.speed import PARTS, bench_speed
 from sitl.bench.speed_report import show_costs, show_figures, show_where
 from sitl.bench.steps import STEPS, bench_steps
 from sitl.bench.steps_report import show_steps
+from sitl.result_folder import result_folder
 from vcl_companion.errors import ConfigError
 
 What = Literal["steps", "robust", "speed", "realtime"]
@@ -30,6 +31,8 @@ _QUICK_SEEDS = 3
 _QUICK_OUTLIERS = 0.3
 
 _T = TypeVar("_T")
+# What each leaves in its folder.
+_OWN = ("steps.*", "robust", "robust.*", "speed.*", "realtime.*", "recording*", "flight")
 
 
 @dataclass(frozen=True)
@@ -54,14 +57,13 @@ def run_bench(out: Path, options: BenchOptions, console: Console) -> None:
     """Measure, show and write the result into a folder.
 
     Raises:
-        ConfigError: a name is nothing's, or the folder cannot be written.
+        ConfigError: a name is nothing's, or the folder is another one's or cannot be written.
     """
     if options.what != "robust" and options.seeds is not None:
         raise ConfigError(f"--seeds is for bench robust; {options.what} has no scenes")
     if options.what == "realtime" and options.only:
         raise ConfigError("--only: realtime has no parts")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
+    with result_folder(out, _OWN):
         if options.what == "speed":
             _run_speed(out, options, console)
             return
@@ -84,10 +86,6 @@ def run_bench(out: Path, options: BenchOptions, console: Console) -> None:
         with _shown(console) as progress:
             rows = bench_robust(out, seeds, progress, cells)
         show_robust(console, rows, out)
-    except FileExistsError as error:
-        raise ConfigError(f"{out}: is a file; give a folder") from error
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be written ({error.strerror})") from error
 
 
 def _run_speed(out: Path, options: BenchOptions, console: Console) -> None:

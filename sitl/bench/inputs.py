@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
+from sitl.embedded import DEMO
 from vcl_companion.errors import RecordingError
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
@@ -22,7 +22,6 @@ from vcl_companion.recording.recording import Drone, read_recording
 from vcl_companion.vision.features import Detector, FeatureOptions, Features, Image, detect
 from vcl_companion.vision.matching import MatchOptions, match_mutual, match_to_entries
 
-DEMO = Path(__file__).parents[1] / "recordings" / "demo"
 FEATURES = FeatureOptions()
 MATCHING = MatchOptions()
 DETECTORS: tuple[Detector, ...] = ("akaze", "sift", "orb")

@@ -16,8 +16,7 @@ from sitl.commands.options import (
     speed_option,
     start_timeout_option,
 )
-
-_DEMO = Path(__file__).parents[1] / "recordings" / "demo"
+from vcl_companion.errors import ConfigError
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -79,10 +78,10 @@ def _names(text: str) -> tuple[str, ...]:
 )
 @click.option(
     "--queue",
-    default=0.5,
-    show_default=True,
+    type=float,
     metavar="S",
-    help="A datagram that would wait for longer for its transmission is dropped, with --rate.",
+    help="A datagram that would wait for longer for its transmission is dropped, with --rate; "
+    "0.5 if not given.",
 )
 @click.option(
     "--partition",
@@ -129,7 +128,7 @@ def fly(
     rate: float | None,
     shared: bool,
     addressed: bool,
-    queue: float,
+    queue: float | None,
     partitions: tuple[str, ...],
     late: tuple[str, ...],
     kills: tuple[str, ...],
@@ -147,6 +146,7 @@ def fly(
     from rich.console import Console
 
     from sitl.absences import parse_blind, parse_kill, parse_late
+    from sitl.embedded import DEMO
     from sitl.firmware import parse_firmware
     from sitl.fly import fly as fly_recording
     from sitl.network import NetworkOptions
@@ -154,6 +154,10 @@ def fly(
     from sitl.plan import FlyOptions, parse_known_distance, parse_setting, pipeline_setting
     from sitl.terminal import progress_shown, show_report
 
+    if parameters and not autopilot:
+        raise ConfigError("--parameter: is for a real --autopilot; the stand-in takes none")
+    if queue is not None and rate is None:
+        raise ConfigError("--queue says how long datagrams wait for the --rate; give one")
     options = FlyOptions(
         speed=speed,
         attitude=attitude,
@@ -176,7 +180,7 @@ def fly(
             rate_bits_per_s=rate,
             shared=shared,
             addressed=addressed,
-            queue_s=queue,
+            **({} if queue is None else {"queue_s": queue}),
             partitions=tuple(map(parse_partition, partitions)),
         ),
         absences=(*map(parse_late, late), *map(parse_kill, kills)),
@@ -186,7 +190,7 @@ def fly(
     embedded = str(recording) == "demo" and not recording.exists()
     console = Console()
     with progress_shown(console) as progress:
-        report = fly_recording(_DEMO if embedded else recording, out, options, progress)
+        report = fly_recording(DEMO if embedded else recording, out, options, progress)
     show_report(console, report, out)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from sitl.consistency.chain import Chain
 from sitl.consistency.report import Beginning, recording_report, write_consistency
+from sitl.result_folder import result_folder
 from vcl_companion.errors import ConfigError, RecordingError
 from vcl_companion.recording import Recording, read_recording
 from vcl_companion.vision.warm_up import warm_up
@@ -45,27 +46,20 @@ def consistency(
 
     Raises:
         RecordingError: a recording cannot be used.
-        ConfigError: the folder cannot be written.
+        ConfigError: the folder is another one's, or cannot be written.
     """
     read = [_usable(path) for path in recordings]
     names = [recording.name for recording in read]
     if len(set(names)) < len(names):
         raise ConfigError(f"two recordings of one name: {', '.join(sorted(names))}")
-    report = _written(out, {})
-    warm_up()
-    found = {}
-    for recording in read:
-        found[recording.name] = recording_report(_beginnings(recording, options, told))
-        report = _written(out, found)
+    with result_folder(out, ("consistency.*",)):
+        report = write_consistency(out, {})
+        warm_up()
+        found = {}
+        for recording in read:
+            found[recording.name] = recording_report(_beginnings(recording, options, told))
+            report = write_consistency(out, found)
     return report
-
-
-def _written(out: Path, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        return write_consistency(out, found)
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be written ({error.strerror})") from error
 
 
 def _usable(path: Path) -> Recording:

@@ -8,6 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
+from sitl.result_folder import result_folder
 from sitl.scale.report import report_of, show_scale, write_scale
 from sitl.scale.swarm import ScaleTimes, SwarmResult, Told, run_swarm
 from vcl_companion.errors import ConfigError
@@ -67,17 +68,12 @@ def scale(out: Path, options: ScaleOptions, told: Told) -> dict[str, Any]:
         The report.
 
     Raises:
-        ConfigError: the folder cannot be written.
+        ConfigError: the folder is another one's, or cannot be written.
     """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
+    with result_folder(out, ("scale.*",)):
         results = [_swarm(n_drones, options, told) for n_drones in sorted(options.drones)]
         report = report_of(results, options.loss, options.seed)
         write_scale(out, report)
-    except FileExistsError as error:
-        raise ConfigError(f"{out}: is a file; give a folder") from error
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be written ({error.strerror})") from error
     return report
 
 

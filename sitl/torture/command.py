@@ -24,10 +24,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
+from sitl.result_folder import result_folder
 from sitl.torture.report import TortureOptions, is_good, report_of, show_torture
 from sitl.torture.session import Failure, SessionResult, run_session
 from vcl_companion.daemon.usage import share_freed
-from vcl_companion.errors import ConfigError
 from vcl_companion.wire.warm_up import warm_up
 
 Progress = Callable[[int, int], None]
@@ -155,15 +155,11 @@ def _warm_up() -> None:
 
 
 def _prepare(out: Path) -> None:
-    try:
-        (out / "failures").mkdir(parents=True, exist_ok=True)
+    with result_folder(out, ("report.json", "failures")):
+        (out / "failures").mkdir(exist_ok=True)
         for old in (out / "failures").iterdir():
             if old.suffix in (".txt", ".bin", ".blob"):
                 old.unlink()
-    except FileExistsError as error:
-        raise ConfigError(f"{out}: is a file; give a folder") from error
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be written ({error.strerror})") from error
 
 
 def _write_failures(out: Path, failures: list[Failure]) -> None:

@@ -205,3 +205,10 @@ def test_nobody_there_is_one_line_and_status_2(order: str) -> None:
     assert result.exit_code == 2
     assert "the companion of any drone is not heard" in result.output
     assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize("within", ["nan", "0.5", "inf", "soon"])
+def test_a_time_that_is_none_is_refused(within: str) -> None:
+    result = CliRunner().invoke(main, ["ground", "pause", "--within", within])
+    assert result.exit_code == 2
+    assert "--within" in result.output

@@ -83,8 +83,8 @@ def test_a_daemon_is_killed_before_it_is_started_again() -> None:
         (["mav7=8"], "'mav7' does not fly (mav0, mav1, mav2)"),
         (["mav0=30"], "--kill mav0=30: the flight is over after 28.4 s"),
         (["mav0=12-28.4"], "--kill mav0=12-28.4: the flight is over after 28.4 s"),
-        (["mav0=12-20", "mav0=15"], "--kill mav0=15: is not running then, by --kill mav0=12-20"),
-        (["mav0=12", "mav0=15"], "--kill mav0=15: is not running then, by --kill mav0=12"),
+        (["mav0=12-20", "mav0=15"], "--kill mav0=15: no longer runs then, by --kill mav0=12-20"),
+        (["mav0=12", "mav0=15"], "--kill mav0=15: no longer runs then, by --kill mav0=12"),
     ],
 )
 def test_absences_that_cannot_be_are_one_clear_line(absences: list[str], says: str) -> None:

@@ -121,7 +121,7 @@ def test_what_cannot_be_used_is_said_in_a_line(tmp_path: Path) -> None:
     file.write_text("")
     status, text = run(DEMO, "--out", file)
     assert status == 2
-    assert "cannot be written" in text
+    assert "is a file; give a folder" in text
     untold = tmp_path / "untold"
     shutil.copytree(DEMO, untold)
     shutil.rmtree(untold / "mav1" / "state_groundtruth_estimate0")

@@ -297,11 +297,32 @@ def test_no_process_is_left_however_a_flight_is_ended(
 
 
 def test_a_daemon_that_does_not_start_says_why(recording: Path, tmp_path: Path) -> None:
-    done = sitl_fly(recording, "--out", tmp_path / "out", "--set", "camera.sorce='oak'")
+    nowhere = tmp_path / "nowhere.yaml"
+    done = sitl_fly(
+        recording, "--out", tmp_path / "out", "--set", f"camera.calibration='{nowhere}'"
+    )
     assert done.returncode == 1
     assert "ended with exit code 2" in done.stderr
-    assert "nearest valid key is camera.source" in done.stderr
+    assert f"{nowhere}: " in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--set", "camera.sorce='oak'"), "--set: camera.sorce: unknown key"),
+        (("--queue", "3"), "--queue says how long datagrams wait for the --rate; give one"),
+        (("--parameter", "EK3_X=1"), "--parameter: is for a real --autopilot"),
+    ],
+)
+def test_what_would_do_nothing_is_refused_before_anything_is_done(
+    recording: Path, tmp_path: Path, options: tuple[str, str], says: str
+) -> None:
+    done = sitl_fly(recording, "--out", tmp_path / "out", *options)
+    assert done.returncode == 2
+    assert says in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def test_input_that_cannot_be_used_is_one_line_and_status_2(

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sitl.network import Delivery, Network, NetworkOptions
-from sitl.partitions import Partition, check_flying, parse_partition
+from sitl.partitions import Partition, check_partitions, parse_partition
 from vcl_companion.errors import ConfigError
 
 N = 20_000
@@ -289,6 +289,8 @@ def test_a_partition_on_the_command_line() -> None:
         with pytest.raises(ConfigError, match=r"--partition .* like 10-40:mav0\|mav1,mav2") as said:
             parse_partition(text)
         assert "\n" not in str(said.value)
-    check_flying([partition], ["mav0", "mav1", "mav2"])
+    check_partitions([partition], ["mav0", "mav1", "mav2"], 10.5)
+    with pytest.raises(ConfigError, match=r"10-40.5:.* the flight is over after 10.0 s"):
+        check_partitions([partition], ["mav0", "mav1", "mav2"], 10.0)
     with pytest.raises(ConfigError, match=r"'mav2' does not fly \(mav0, mav1\)"):
-        check_flying([partition], ["mav0", "mav1"])
+        check_partitions([partition], ["mav0", "mav1"], 60.0)

@@ -455,6 +455,8 @@ def test_input_that_cannot_be_used_is_one_line_and_status_2(tmp_path: Path) -> N
         (("--out", out, "--seconds", "0"), "--seconds must be positive"),
         (("--out", out, "--set", "log.level=debug"), "a string needs quotes"),
         (("--out", tmp_path / "file", "--only", "rotate"), "is a file"),
+        (("--out", tmp_path / "out", "--set", "foo=1"), "--set: foo: unknown key"),
+        (("--out", tmp_path / "out", "--start-timeout", "0"), "--start-timeout must be positive"),
         (("--out", tmp_path / "full", "--only", "rotate"), "holds something else"),
     ):
         done = CliRunner().invoke(main, ["paper", *map(str, arguments)])

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sitl.fly import fly
 from sitl.out_folder import prepare_folder
 from sitl.plan import FlyOptions, Setting, parse_known_distance, parse_setting, plan_flight
 from tests.sitl.flights import Flight, at_ns, ned_from_body, write_recording
@@ -66,6 +67,9 @@ def test_what_does_not_fit_says_what_would(recording: Recording, tmp_path: Path)
         return str(raised.value)
 
     assert "no 'mav7' (mav0, mav1, mav2)" in message(FlyOptions(drones=("mav7",)))
+    assert "mav0 is given twice" in message(FlyOptions(drones=("mav0", "mav1", "mav0")))
+    twice = (KnownPair("mav0", "mav1", 1.0), KnownPair("mav1", "mav0", 2.0))
+    assert "mav0:mav1: is given twice" in message(FlyOptions(known_distances=twice))
     assert "'mav2' does not fly" in message(
         FlyOptions(drones=("mav0", "mav1"), known_distances=(KnownPair("mav0", "mav2", 1.0),))
     )
@@ -103,6 +107,27 @@ def test_a_setting_on_the_command_line() -> None:
     for text in ("log.level", "log.level=debug", "=1", "a..b=1", "a=1\nb=2", "a b=1"):
         with pytest.raises(ConfigError, match="--set"):
             parse_setting(text)
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        (Setting(("foo",), 1), "--set: foo: unknown key"),
+        (Setting(("localization", "foo"), 1), "--set: localization.foo: unknown key"),
+        (Setting(("swarm", "members"), [1]), "--set: [swarm] known_distances"),
+        (Setting(("transfer", "profile"), "x"), "--set: transfer.profile"),
+    ],
+)
+def test_a_setting_that_no_daemon_takes_leaves_a_finished_flight_as_it_is(
+    recording: Recording, tmp_path: Path, setting: Setting, says: str
+) -> None:
+    out = tmp_path / "out"
+    prepare_folder(out, plan_flight(recording, FlyOptions()))
+    (out / "report.json").touch()
+    with pytest.raises(ConfigError) as raised:
+        fly(recording.path, out, FlyOptions(settings=(setting,)), lambda *_: None)
+    assert says in str(raised.value)
+    assert (out / "report.json").exists()
 
 
 def test_the_output_folder_is_cleared_of_flights_and_of_nothing_else(
