@@ -215,3 +215,31 @@ def test_whatever_is_heard_alive_is_who_was_heard_lately(heard: list[tuple[int, 
         kinds = [type(event) for event in events if event.peer == peer]
         expected = [PeerJoined, PeerLost] * len(kinds)
         assert kinds == expected[: len(kinds)]
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["heard", "says", "joins", "waits"]),
+            st.integers(1, 4),
+            st.integers(0, 3),
+        ),
+        max_size=30,
+    )
+)
+def test_teammates_are_who_is_alive_and_says_that_it_flies_with_our_team(
+    events: list[tuple[str, int, int]],
+) -> None:
+    group, now_s = Group(SwarmOptions((1, 2, 3, 4)), 2), 0.0
+    for what, member, team in events:
+        match what:
+            case "heard":
+                group.heartbeat(member, now_s)
+            case "says" if member != group.own_id:
+                group.map_state(member, MapState(b"new     ", 900, True, team=team), now_s)
+            case "joins":
+                group.join(team)
+            case "waits":
+                now_s += team * 2.0
+                group.poll(now_s)
+        assert group.teammates == tuple(m for m in group.alive if group.team_of(m) == group.team)

@@ -70,6 +70,7 @@ class Group:
         self.leader = options.leader or self.members[0]
         self.measured = tuple(sorted({m for a, b, _ in options.known_distances for m in (a, b)}))
         self._timeout_s = options.heartbeat_timeout_s
+        self._silent_s = max(_SILENT * self._timeout_s, _SILENT_S)
         self._leader_wait_s = options.leader_wait_s
         self._heard_at_s: dict[int, float] = {}  # members alive
         self._ever_heard: set[int] = set()
@@ -77,6 +78,8 @@ class Group:
         self._distrusted: frozenset[int] = frozenset()
         self._apart: frozenset[int] = frozenset()
         self._team = 0
+        # Asked for with every message, and changed by hardly any; None: to be found anew.
+        self._teammates: tuple[int, ...] | None = None
         self._epochs = Epochs(own_id)
         self._graph = OverlapGraph(self.members, OverlapOptions())
         self._parting = Parting(self._graph, options.split_after_s)
@@ -159,7 +162,9 @@ class Group:
     @property
     def teammates(self) -> tuple[int, ...]:
         """Members alive that fly with our team, this drone among them, ascending."""
-        return tuple(m for m in self.alive if self.team_of(m) == self._team)
+        if self._teammates is None:
+            self._teammates = tuple(m for m in self.alive if self.team_of(m) == self._team)
+        return self._teammates
 
     @property
     def trusted_teammates(self) -> tuple[int, ...]:
@@ -199,7 +204,7 @@ class Group:
     def join(self, team: int) -> None:
         """Fly with a team from now on: its map has been taken."""
         if team != self._team:
-            self._team = team
+            self._go_to(team)
             self._take_term()
 
     def is_fenced(self, peer: int) -> bool:
@@ -220,6 +225,7 @@ class Group:
         self._heard_at_s[peer] = max(now_s, self._heard_at_s.get(peer, now_s))
         self._ever_heard.add(peer)
         if is_new:
+            self._teammates = None
             self._take_term()
         return [PeerJoined(peer)] if is_new else []
 
@@ -231,11 +237,13 @@ class Group:
         before = self._states.get(peer, _SAID_NOTHING)
         has_moved = peer not in self._distrusted and self._takes_us_along(peer, state)
         self._states[peer] = state
+        if state.team != before.team:
+            self._teammates = None
         if peer not in self._distrusted:
             self._epochs.hear(state.team, state.epoch)
             self._graph.note(peer, state.signature, now_s)
         if has_moved:
-            self._team = state.team
+            self._go_to(state.team)
         if (state.team, state.epoch) != (before.team, before.epoch):
             self._take_term()
         return events
@@ -334,8 +342,7 @@ class Group:
     def _is_silent(self, member: int) -> bool:
         """Whether a member may be lost, which is known later: nobody else waits for its word."""
         heard_at_s = self._heard_at_s.get(member)
-        silent_s = max(_SILENT * self._timeout_s, _SILENT_S)
-        return heard_at_s is not None and self._now_s >= heard_at_s + silent_s
+        return heard_at_s is not None and self._now_s >= heard_at_s + self._silent_s
 
     def most_others_hold(self, revision: bytes) -> bool:
         """Whether most of the other teammates trusted, and at least two, hold a revision."""
@@ -353,10 +360,11 @@ class Group:
         for peer in late:
             del self._heard_at_s[peer]
             self._states.pop(peer, None)
+            self._teammates = None
             self._graph.forget(peer)
         self._graph.poll(now_s)
         roster = self._roster()
-        self._team = self._team_by(roster)
+        self._go_to(self._team_by(roster))
         self._meetings.poll(roster, now_s)
         self._take_term()
         return [PeerLost(peer) for peer in sorted(late)]
@@ -388,6 +396,10 @@ class Group:
     def _note_time(self, now_s: float) -> None:
         self._began_at_s = min(self._began_at_s, now_s)
         self._now_s = max(self._now_s, now_s)
+
+    def _go_to(self, team: int) -> None:
+        if team != self._team:
+            self._team, self._teammates = team, None
 
     def _take_term(self) -> None:
         """Take an epoch when this drone has begun to coordinate, or hears of a newer one."""

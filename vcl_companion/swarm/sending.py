@@ -1,7 +1,7 @@
 """One blob on its way to one peer or several: what to send next, by what they say is missing.
 
 The sender sends every chunk once and asks what arrived: with its first chunk
-(the peer may have most of it already), about once a second, and with its last.
+(the peer may have most of it already), every five status intervals, and with its last.
 Every ask ends a *segment* of sent chunks and is numbered; the answer repeats
 the number, so that a chunk counts as lost only if it was sent before the ask
 that the answer answers. An answer that stays out is asked for again, ever more
