@@ -48,6 +48,8 @@ MIB = 1 << 20
 # A daemon's own limits hold thirty times what is sent here; these are reached.
 TRANSFER = TransferOptions(max_blob_bytes=MIB, memory_quota_bytes=4 * MIB)
 _FIX_SIGMA = 0.01
+# Who is told to end has so many turns for it, and no time.
+_TURNS_TO_END = 100
 
 
 class WatchedTransfers(Transfers):
@@ -237,11 +239,20 @@ class TorturedDrone:
                 assert np.isfinite(state.pose_covariance()).all(), "a state that is not finite"
 
     async def end(self) -> None:
-        """Stop all that it does."""
+        """Stop all that it does.
+
+        Raises:
+            RuntimeError: something of it goes on; waiting for it would take for ever.
+        """
         for task in self._tasks:
             task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        for _ in range(_TURNS_TO_END):
+            await asyncio.sleep(0)
         self._parts.end()
+        going_on = asyncio.all_tasks() - {asyncio.current_task()}
+        if going_on:
+            names = sorted(repr(task.get_coro()) for task in going_on)
+            raise RuntimeError(f"told to end, these go on: {', '.join(names)}")
 
 
 def _fix(pose: Pose) -> Localized:

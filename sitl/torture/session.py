@@ -163,18 +163,24 @@ class _Session:
                     self._fail(_first_cause(error))
                 if broken:
                     self._take_counts(drone)
-                    await drone.end()
+                    await self._end(drone)
                     drone = self._new_drone()
                 if only_last and k < payloads - 1:
                     result.failures.clear()
                 result.payloads += 1
             self._take_counts(drone)
-            await drone.end()
+            await self._end(drone)
         result.seconds = time.process_time() - began_s
         return result
 
     def _new_drone(self) -> TorturedDrone:
         return TorturedDrone(self._role, self._heard, self._clock, self._drone_rng)
+
+    async def _end(self, drone: TorturedDrone) -> None:
+        try:
+            await drone.end()
+        except RuntimeError as error:
+            self._fail(error)
 
     def _let_time_pass(self) -> None:
         self._loop.now_s += _STEP_S

@@ -163,6 +163,25 @@ def test_what_cannot_be_merged_stays_in_its_own_world_and_it_is_said_why(tmp_pat
     run(scenario())
 
 
+def test_a_drone_that_is_ended_while_it_merges_ends_at_once(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            one = await members.start(1, flies_on=(1, 2), runs=False)
+            life = asyncio.ensure_future(one.run())
+            two = await members.start(2, flies_on=(1, 2))
+            three = await members.start(3, flies_on=(1, 2, 3))
+            three.track(50)
+            await until(lambda: told_of(one, two, three))
+            hurry(6.0)
+            await until(lambda: bool(one.events("merge")))
+            life.cancel()
+            for _ in range(100):  # however many turns that takes, and no time
+                await asyncio.sleep(0)
+            assert life.done()
+
+    run(scenario())
+
+
 def test_there_is_a_way_within_a_world_and_where_a_map_was_joined() -> None:
     pair = StoredMap(revision_of(PAIR), PAIR, demo.map_index(1, 2))
     child = demo.encoded_update()

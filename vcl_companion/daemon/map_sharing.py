@@ -172,11 +172,12 @@ class MapSharing:
         self.is_merging = True
         try:
             await self._round_is_over()
-            return await self._merge_into_current(peer, offer)
+            is_merged = await self._merge_into_current(peer, offer)
         finally:
             self.is_merging = False
-            # Whoever offers one after the other does not keep ours from being extended.
-            await asyncio.sleep(_BETWEEN_MERGES_S)
+        # Whoever offers one after the other does not keep ours from being extended.
+        await asyncio.sleep(_BETWEEN_MERGES_S)
+        return is_merged
 
     async def _round_is_over(self) -> None:
         """Wait for the round that is under way: merged with what it replaces, all would be in vain.
