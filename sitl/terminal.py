@@ -22,6 +22,7 @@ from sitl.lives_report import LIFE_COLUMNS, life_rows
 from sitl.network_report import DELAYS, NETWORK_COLUMNS, delay_text, message_rows
 from sitl.page_style import Column, cells
 from sitl.phases import PHASE_COLUMNS, phase_rows
+from sitl.tables import broken, print_table
 
 
 @contextmanager
@@ -63,12 +64,12 @@ def _line_per_stage(console: Console) -> Progress:
 
 def show_report(console: Console, report: Mapping[str, Any], out: Path) -> None:
     """Print a flight's table, what needs attention, and where the report is."""
-    table = _numbers((
+    heads = (
         "drone", "frames", "localized\n%", "refused", "dropped", "ATE\nm", "aligned\nm",
         "yaw\ndeg", "p50\nms", "p99\nms", "CPU\n%", "RSS\nMB",
-    ))  # fmt: skip
-    for name, drone in report["drones"].items():
-        table.add_row(
+    )  # fmt: skip
+    rows = [
+        (
             name,
             str(drone["frames"]),
             f"{100.0 * drone['localized_share']:.1f}",
@@ -82,23 +83,26 @@ def show_report(console: Console, report: Mapping[str, Any], out: Path) -> None:
             _number(None if drone["cpu_share"] is None else 100.0 * drone["cpu_share"], 0),
             _number(drone["resident_mb"], 0),
         )
-    console.print(table)
+        for name, drone in report["drones"].items()
+    ]
+    print_table(console, heads, rows)
     _show_parts(console, report, "fused", "autopilot", FUSED_COLUMNS)
     _show_parts(console, report, "mission", "drone", MISSION_COLUMNS)
     lives = life_rows(report)
     if lives:
-        heads = (label.replace(" s", "\ns") for _, label in LIFE_COLUMNS)
-        table = _numbers(("daemon", *heads))
-        for name, values in lives:
-            table.add_row(name, *(_number(value, 2) for value in values))
-        console.print(table)
+        print_table(
+            console,
+            ["daemon", *(broken(label) for _, label in LIFE_COLUMNS)],
+            [(name, *(_number(value, 2) for value in values)) for name, values in lives],
+        )
     phases = phase_rows(report)
     if phases:
-        heads = (_broken(label) for _, label, _ in PHASE_COLUMNS)
-        table = _numbers(("phase", "drone", *heads))
-        for phase, name, texts in phases:
-            table.add_row(phase, name, *texts)
-        console.print(table)
+        print_table(
+            console,
+            ["phase", "drone", *(broken(label) for _, label, _ in PHASE_COLUMNS)],
+            [(phase, name, *texts) for phase, name, texts in phases],
+            keys=2,
+        )
     _show_network(console, report)
     for event in report["events"]:
         if event["kind"] == "harness":
@@ -114,28 +118,22 @@ def _show_parts(
     said = {name: drone[part] for name, drone in report["drones"].items() if drone[part]}
     if not said:
         return
-    heads = (_broken(label) for _, label, _, _ in columns)
-    table = _numbers((whose, *heads))
-    for name, values in said.items():
-        table.add_row(name, *cells(columns, values, none="-"))
-    console.print(table)
-
-
-def _broken(label: str) -> str:
-    """Return a head with its unit on a line of its own."""
-    return "\n".join(label.rsplit(" ", 1))
+    heads = (whose, *(broken(label) for _, label, _, _ in columns))
+    rows = [(name, *cells(columns, values, none="-")) for name, values in said.items()]
+    # A mission that went wrong says how, in a sentence.
+    sentences = [k for k, (_, _, form, _) in enumerate(columns, 1) if form == "{}"]
+    print_table(console, heads, rows, wraps=sentences)
 
 
 def _show_network(console: Console, report: Mapping[str, Any]) -> None:
     """Print what the drones sent each other, and what became of it, if it was counted."""
-    rows = message_rows(report)
-    if not rows:
+    messages = message_rows(report)
+    if not messages:
         return
     drones = report["drones"]
     heads = ("to peers", "messages", "payload\nkB", "wire\nkB", "%", "B/s")
-    table = _numbers((*heads, *(f"{name}\nkB" for name in drones)))
-    for row in rows:
-        table.add_row(
+    rows = [
+        (
             row.name,
             str(row.messages),
             _number(row.payload_bytes / 1e3, 1),
@@ -144,23 +142,20 @@ def _show_network(console: Console, report: Mapping[str, Any]) -> None:
             _number(row.wire_bytes_per_s, 0),
             *(_number(n / 1e3, 1) for n in row.by_drone),
         )
-    console.print(table)
-    labels = (label.replace(" ", "\n") for _, label in NETWORK_COLUMNS)
-    table = _numbers(("network", *labels, "delay\nms", "longest\nms"))
-    for name, drone in drones.items():
-        said = drone["peer_link"]["network"]
-        counts = (str(said[key]) for key, _ in NETWORK_COLUMNS)
-        table.add_row(name, *counts, *(delay_text(said[key]) for key in DELAYS))
-    console.print(table)
-
-
-def _numbers(heads: Sequence[str]) -> Table:
-    """Return a table whose first column names what the numbers in the others are of."""
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
-    table.add_column(heads[0], no_wrap=True)
-    for head in heads[1:]:
-        table.add_column(head, justify="right", no_wrap=True)
-    return table
+        for row in messages
+    ]
+    print_table(console, (*heads, *(f"{name}\nkB" for name in drones)), rows)
+    labels = (broken(label) for _, label in NETWORK_COLUMNS)
+    said = {name: drone["peer_link"]["network"] for name, drone in drones.items()}
+    fates = [
+        (
+            name,
+            *(str(network[key]) for key, _ in NETWORK_COLUMNS),
+            *(delay_text(network[key]) for key in DELAYS),
+        )
+        for name, network in said.items()
+    ]
+    print_table(console, ("network", *labels, "delay\nms", "longest\nms"), fates)
 
 
 def show_goals(console: Console, goals: Mapping[str, Sequence[Goal]], out: Path) -> None:

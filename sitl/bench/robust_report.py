@@ -8,14 +8,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from sitl.bench.cases import N_MATCHES, TASKS
 from sitl.bench.machine import machine
 from sitl.bench.rows import RIVALS, Row, Verdict, verdicts
 from sitl.bench.trial import RIGHT_DIRECTION_DEG, RIGHT_POSITION_M, RIGHT_ROTATION_DEG
+from sitl.tables import print_table
 
 _SHOWN = ("ours", *RIVALS, "best")
 
@@ -55,11 +54,7 @@ def write_robust(
 def show_robust(console: Console, rows: Sequence[Row], out: Path) -> None:
     """Print success and time of everybody, a line per cell, and which cells miss the goal."""
     judged = {verdict.cell: verdict for verdict in verdicts(rows)}
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
-    table.add_column("success %, median ms", no_wrap=True)
-    for name in _SHOWN:
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("goal")
+    table, styles = [], []
     for cell, there in _by_cell(rows):
         texts = [
             f"{100 * there[name].success:.1f} {there[name].milliseconds:6.1f}"
@@ -70,8 +65,10 @@ def show_robust(console: Console, rows: Sequence[Row], out: Path) -> None:
         verdict = judged.get(there[next(iter(there))].cell)
         met = verdict is not None and not verdict.missed
         goal = "-" if verdict is None else "met" if met else "MISSED"
-        table.add_row(cell, *texts, goal, style=None if met or verdict is None else "bold red")
-    console.print(table)
+        table.append((cell, *texts, goal))
+        styles.append(None if met or verdict is None else "bold red")
+    heads = ("success %,\nmedian ms", *_SHOWN, "goal")
+    print_table(console, heads, table, wraps=(len(heads) - 1,), styles=styles)
     console.print(_summary(list(judged.values())), markup=False, highlight=False)
     console.print(f"report: {out / 'robust.md'}", markup=False, highlight=False, soft_wrap=True)
 

@@ -9,14 +9,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich import box
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from sitl.bench.figures import Figure
 from sitl.bench.machine import machine
 from sitl.bench.speed_growth import COLUMNS, CostTable
+from sitl.tables import broken, print_table
 
 _HOW = (
     "Processor time of one thread, where nothing else is said; what stands in one table was "
@@ -68,24 +66,16 @@ def write_realtime(out: Path, daemons: dict[str, tuple[Figure, ...]], how: str) 
 
 def show_figures(console: Console, figures: Sequence[Figure], title: str = "") -> None:
     """Print numbers and whether their goals are met; a missed one in red."""
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
-    for k, head in enumerate((title or "what", "measured", "goal", "", "how")):
-        table.add_column(head, justify="right" if k in (1, 2) else "left", no_wrap=k < 4)
-    for figure in figures:
-        style = "bold red" if figure.met is False else None
-        table.add_row(*map(escape, _figure_cells(figure)), style=style)
-    console.print(table)
+    heads = (title or "what", "measured", "goal", "", "how")
+    styles = ["bold red" if figure.met is False else None for figure in figures]
+    print_table(console, heads, [*map(_figure_cells, figures)], wraps=(0, 3, 4), styles=styles)
 
 
 def show_costs(console: Console, tables: Iterable[CostTable]) -> None:
     """Print costs by size, and how they grow."""
     for cost in tables:
-        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
-        for k, head in enumerate((cost.title, *_COST_HEAD[1:])):
-            table.add_column(head, justify="left" if k == 0 else "right")
-        for row in _cost_cells(cost):
-            table.add_row(*row)
-        console.print(table)
+        heads = (cost.title, *map(broken, _COST_HEAD[1:]))
+        print_table(console, heads, _cost_cells(cost))
 
 
 def show_where(console: Console, path: Path) -> None:

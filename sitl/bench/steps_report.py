@@ -7,12 +7,11 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from sitl.bench.machine import machine
 from sitl.bench.timing import Measured
+from sitl.tables import broken, print_table
 
 _HEAD = ("step", "who", "median ms", "p95 ms", "times ours", "accuracy")
 _HOW = (
@@ -34,13 +33,10 @@ def write_steps(out: Path, results: Sequence[Measured]) -> None:
 
 def show_steps(console: Console, results: Sequence[Measured], out: Path) -> None:
     """Print all times; a wrong answer in red."""
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
-    for k, title in enumerate(_HEAD):
-        table.add_column(title, justify="right" if 2 <= k <= 4 else "left", no_wrap=k < 5)
-    for k, result in enumerate(results):
-        style = None if result.accuracy.right else "bold red"
-        table.add_row(*_cells(results, k), style=style)
-    console.print(table)
+    rows = [_cells(results, k) for k in range(len(results))]
+    styles = [None if result.accuracy.right else "bold red" for result in results]
+    heads = [broken(head) for head in _HEAD]
+    print_table(console, heads, rows, keys=2, wraps=(0, 1, 5), styles=styles)
     console.print(f"report: {out / 'steps.md'}", markup=False, highlight=False, soft_wrap=True)
 
 

@@ -11,15 +11,14 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from sitl.bench.figures import Growth
 from sitl.bench.machine import machine
 from sitl.plotting import STYLE, WIDTH_IN, colour, svg
 from sitl.report import rounded
 from sitl.scale.swarm import Phase, SwarmResult
+from sitl.tables import broken, print_table
 
 _COLUMNS = ("drones", "phase", "s", "sent B/s", "most", "heard B/s", "CPU %", "most",
             "held by half s", "by all s")  # fmt: skip
@@ -190,10 +189,5 @@ def write_scale(out: Path, report: dict[str, Any]) -> None:
 
 def show_scale(console: Console, report: dict[str, Any], out: Path) -> None:
     """Print the table, and where it is."""
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
-    for n, head in enumerate(_COLUMNS):
-        table.add_column(head, justify="left" if n == 1 else "right")
-    for row in cells_of(report):
-        table.add_row(*row)
-    console.print(table)
+    print_table(console, [broken(head) for head in _COLUMNS], cells_of(report), keys=2)
     console.print(f"report: {out / 'scale.md'}", markup=False, highlight=False, soft_wrap=True)

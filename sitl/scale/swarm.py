@@ -102,14 +102,12 @@ def run_swarm(n_drones: int, loss: float, seed: int, times: ScaleTimes, told: To
     """
     cv2.setNumThreads(1)
     warm_up()
-    loop = MeteredLoop()
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            key = Path(folder) / "key"
-            make_key_file(key)
-            return loop.run_until_complete(_lived(n_drones, loss, seed, times, str(key), told))
-    finally:
-        loop.close()
+    with tempfile.TemporaryDirectory() as folder:
+        key = Path(folder) / "key"
+        make_key_file(key)
+        # A runner ends every task before it closes the loop, on Ctrl-C too.
+        with asyncio.Runner(loop_factory=MeteredLoop) as runner:
+            return runner.run(_lived(n_drones, loss, seed, times, str(key), told))
 
 
 async def _lived(

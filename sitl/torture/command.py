@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import faulthandler
 import json
-import multiprocessing
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ from rich.progress import Progress as Bar
 from sitl.result_folder import result_folder
 from sitl.torture.report import TortureOptions, is_good, report_of, show_torture
 from sitl.torture.session import Failure, SessionResult, run_session
+from sitl.torture.workers import deaf_to_ctrl_c, workers
 from vcl_companion.daemon.usage import share_freed
 from vcl_companion.wire.warm_up import warm_up
 
@@ -53,11 +53,12 @@ def torture(out: Path, options: TortureOptions, progress: Progress) -> dict[str,
     began_s = time.monotonic()
     results = []
     done = 0
-    for result in _sessions(options):
-        results.append(result)
-        done += result.payloads
-        progress(done, options.payloads)
-        _write_failures(out, result.failures)
+    with closing(_sessions(options)) as sessions:
+        for result in sessions:
+            results.append(result)
+            done += result.payloads
+            progress(done, options.payloads)
+            _write_failures(out, result.failures)
     wall_s = time.monotonic() - began_s
     report = report_of(options, sorted(results, key=lambda r: r.session), wall_s)
     text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
@@ -114,7 +115,7 @@ def _print(console: Console, text: str) -> None:
     console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-def _sessions(options: TortureOptions) -> Iterator[SessionResult]:
+def _sessions(options: TortureOptions) -> Generator[SessionResult, None, None]:
     """Yield the sessions of a run as they are over."""
     n = -(-options.payloads // options.session)
     lengths = [options.session] * (n - 1) + [options.payloads - (n - 1) * options.session]
@@ -124,12 +125,12 @@ def _sessions(options: TortureOptions) -> Iterator[SessionResult]:
         for session, payloads in enumerate(lengths):
             yield run_session(options.seed, session, options.session, payloads)
         return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, context, initializer=_warm_up) as pool:
-        waiting = [
-            pool.submit(run_session, options.seed, session, options.session, payloads)
-            for session, payloads in enumerate(lengths)
-        ]
+    with workers(processes, _warm_up) as pool:
+        with deaf_to_ctrl_c():
+            waiting = [
+                pool.submit(run_session, options.seed, session, options.session, payloads)
+                for session, payloads in enumerate(lengths)
+            ]
         numbers = {future: session for session, future in enumerate(waiting)}
         for future in as_completed(waiting):
             try:

@@ -110,11 +110,9 @@ def run_session(
         only_last: whether only failures of the last of these are kept.
     """
     loop = CountedLoop()
-    try:
-        fed = _Session(seed, session, length, loop).run(payloads, only_last)
-        result = loop.run_until_complete(fed)
-    finally:
-        loop.close()
+    # A runner ends every task before it closes the loop, on Ctrl-C too.
+    with asyncio.Runner(loop_factory=lambda: loop) as runner:
+        result = runner.run(_Session(seed, session, length, loop).run(payloads, only_last))
     gc.collect()
     give_back_freed()
     result.kept_bytes = resident_bytes()

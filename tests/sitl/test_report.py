@@ -118,6 +118,20 @@ def test_a_partition_s_phases_are_told_apart(tmp_path: Path) -> None:
     assert "apart, 0.5-1.5 s" in console.file.getvalue()
 
 
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_no_figure_is_cut_on_a_narrow_terminal(tmp_path: Path, width: int) -> None:
+    _, report, out = reported(tmp_path, Flight())
+    drone = report["drones"]["mav1"]
+    drone |= {"ate_m": 0.123, "yaw_rmse_deg": 12.34, "resident_mb": 2048.0}
+    drone["latency_ms"] |= {"p50": 118.1, "p99": 1150.9}
+    printed = io.StringIO()
+    show_report(Console(file=printed, width=width), report, out)
+    assert "…" not in printed.getvalue()
+    words = printed.getvalue().split()
+    for figure in ("0.123", "12.34", "118.1", "1150.9", "2048"):
+        assert words.count(figure) == 1
+
+
 def test_without_a_partition_there_are_no_phases(tmp_path: Path) -> None:
     result, report, out = reported(tmp_path, Flight())
     assert report["drones"]["mav0"]["phases"] == []
