@@ -9,16 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from sitl import evaluation
 from sitl.bench.machine import machine
 from sitl.consistency.chain import Look
 from sitl.default_goals import NEES_MEDIAN
 from sitl.report import rounded
+from sitl.tables import print_table
 
 # 99.9 % of chi^2 with 6 degrees of freedom.
 _FAR = 22.5
@@ -112,14 +110,10 @@ def write_consistency(out: Path, recordings: dict[str, dict[str, Any]]) -> dict[
 
 def show_consistency(console: Console, report: dict[str, Any], out: Path) -> None:
     """Print the table, and where it is."""
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
     # A line of a terminal has no room for each beginning.
     shown = [n for n, head in enumerate(_COLUMNS) if head != _OF_EACH]
-    for n in shown:
-        table.add_column(_COLUMNS[n], justify="left" if n == 0 else "right", overflow="fold")
-    for row in _rows(report["recordings"]):
-        table.add_row(*(escape(row[n]) for n in shown))
-    console.print(table)
+    rows = _rows(report["recordings"])
+    print_table(console, [_COLUMNS[n] for n in shown], [[row[n] for n in shown] for row in rows])
     for text in _ends(report["recordings"]):
         console.print(text, markup=False, highlight=False, soft_wrap=True)
     path = out / "consistency.md"
