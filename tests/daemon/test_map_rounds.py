@@ -249,6 +249,40 @@ def test_a_view_that_its_patches_do_not_join_is_joined_by_its_features(tmp_path:
     run(scenario())
 
 
+def test_newer_views_are_tried_before_features_are_searched_for(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            one, two = [
+                await members.start(system_id, flies_on=(1, 2), update=UPDATES)
+                for system_id in (1, 2)
+            ]
+
+            async def see_from_aside(k: int) -> None:
+                for drone in (one, two):
+                    true = demo.world_from_body(drone.system_id, k)
+                    aside = true.translation + np.array([0.0, -6.0, 0.0])
+                    await drone.see(demo.frame(drone.system_id, k))
+                    drone.track(FEW, Pose(true.rotation, aside))
+
+            await see_from_aside(12)
+            await passes_until(lambda: bool(one.events("update")))
+            await computed(lambda: bool(one.events("no update")))
+            assert one.events("no update") == ["no view joins the map by its patches"]
+            assert one.revision == revision_of(PAIR)
+            await see_from_aside(14)
+            await passes_until(lambda: len(one.events("update")) == 2)
+            await computed(lambda: one.revision == two.revision != revision_of(PAIR))
+            joined = [k for k in keyframes_by(1, one) if k.captured_at_ns == demo.shot(1, 14).at_ns]
+            assert_pose_close(
+                joined[0].world_from_body,
+                demo.world_from_body(1, 14),
+                within_m=0.2,
+                within_rad=0.02,
+            )
+
+    run(scenario())
+
+
 def test_a_round_without_result_is_said_and_the_old_map_stays(tmp_path: Path) -> None:
     async def scenario() -> None:
         async with swarm(1, 2, path=tmp_path) as members:
