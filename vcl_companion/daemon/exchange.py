@@ -113,11 +113,9 @@ class Exchange:
         self._group = group
         self._transfers = transfers
         self._maps = maps
-        self._clock = clock
         self._log = log
         self._estimator = estimator
         self._work = work
-        self._options = options
         self._outbox = Outbox(transfers)
         self._refusals = Refusals(log)
         self.trust = PeerTrust(
