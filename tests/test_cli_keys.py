@@ -92,7 +92,8 @@ def test_mistakes_are_one_line_and_status_2(tmp_path: Path, key: Path) -> None:
     before = key.read_text()
     assert_one_line(vcl("new", key), "is there already")
     assert key.read_text() == before
-    assert_one_line(vcl("new", tmp_path / "nowhere" / "key"), "No such file")
+    no_folder = f"there is no folder {tmp_path / 'nowhere'}; make it first"
+    assert_one_line(vcl("new", tmp_path / "nowhere" / "key"), no_folder)
     assert_one_line(vcl("show", tmp_path / "none"), "none: No such file")
     assert_one_line(vcl("show", tmp_path), "Is a directory")
     (tmp_path / "text").write_text("my secret")

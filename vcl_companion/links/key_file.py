@@ -133,4 +133,8 @@ def _key_of(passphrase: str) -> SigningKey:
 
 
 def _why(error: OSError | ValueError) -> str:
+    if isinstance(error, FileNotFoundError) and error.filename:
+        folder = Path(error.filename).parent
+        if not folder.is_dir():
+            return f"there is no folder {folder}; make it first"
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
