@@ -294,9 +294,9 @@ class MapRounds:
         its revision before.
         """
         if isinstance(frames, list) and self._options.map.patches:
+            is_second_look, self._is_second_look = self._is_second_look, False
             built = await self._updated(stored, frames, at_once=True)
             if isinstance(built, LandmarkMap):
-                self._is_second_look = False
                 # Who is no more the coordinator has no say any more, and a map that came is newer.
                 if self._is_past(stored):
                     return
@@ -310,7 +310,11 @@ class MapRounds:
                     return
                 stored = current
                 await self._delivered(stored)
-            elif self._is_worth_another_look(frames, lost):
+            elif not (is_second_look or lost or any(f.world_from_body is None for f in frames)):
+                # Newer frames first: single views that do not join are followed by ones that do,
+                # and features take seconds, in which who is on the move comes to where the map
+                # has nothing. They come soon, as if this one had helped.
+                self._is_second_look = self._is_from_new_places = True
                 await self._decide(built, stored, request_id)
                 return
         if self._is_past(stored):
@@ -322,19 +326,6 @@ class MapRounds:
             await self._decide(built, stored, request_id)
             if isinstance(built, LandmarkMap):
                 self._note_places(built, stored)
-
-    def _is_worth_another_look(self, frames: list[FrameAnswer], lost: tuple[int, ...]) -> bool:
-        """Whether newer frames are to be tried before features are looked for all over the map.
-
-        Where all know where they are, single views that do not join are followed by ones that do;
-        features take seconds, in which who is on the move comes to where the map has nothing.
-        """
-        if self._is_second_look or lost or any(f.world_from_body is None for f in frames):
-            self._is_second_look = False
-            return False
-        # They come soon, as if this one had helped.
-        self._is_second_look = self._is_from_new_places = True
-        return True
 
     def _note_places(self, built: LandmarkMap, stored: StoredMap) -> None:
         """Note whether a map, if it is in use now, was extended from places that were new to it."""
