@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl.autopilots.motion import RecordedMotion
-from sitl.evaluation import Estimates
+from sitl.evaluation import Estimates, position_rms_m
 from sitl.page_style import Column
 from sitl.processes import FlightError
 from vcl_companion.geometry.pose import Pose
@@ -108,7 +108,7 @@ def read_fused(
     error = ref_from_world.apply(positions[theirs]) - true.positions_m
     if has_own_height:
         error[:, 2] -= np.median(error[:, 2])
-    ate_m, own_ate_m = _rms(error), _rms(own_error)
+    ate_m, own_ate_m = position_rms_m(error), position_rms_m(own_error)
     speeds = true.velocities_m_s
     moved = float(np.sum(speeds**2))
     ahead_s = float(np.sum(speeds * error)) / moved if moved > 0.0 else None
@@ -120,10 +120,6 @@ def read_fused(
         ate_m / own_ate_m if own_ate_m > 0.0 else None,
         None if ahead_s is None else ahead_s * 1e3,
     )
-
-
-def _rms(error: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
 
 def _read_positions(path: Path) -> tuple[NDArray[np.int64], Array]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sitl.evaluation import PoseErrors
+from sitl.evaluation import PoseErrors, position_rms_m
 from sitl.paper_estimates import SourceEstimates, nees_median
 from sitl.paper_flights import PaperFlight
 from sitl.result import DroneResult
@@ -170,7 +170,7 @@ def _per_axis(errors_m: Array) -> dict[str, float]:
 
 
 def _rms_3d_cm(errors_m: Array) -> float:
-    return float(100.0 * np.sqrt(np.mean(np.sum(np.square(errors_m), axis=1))))
+    return 100.0 * position_rms_m(errors_m)
 
 
 def _rms_deg(errors_rad: Array) -> float:

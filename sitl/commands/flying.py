@@ -180,7 +180,7 @@ def fly(
             rate_bits_per_s=rate,
             shared=shared,
             addressed=addressed,
-            **({} if queue is None else {"queue_s": queue}),
+            queue_s=NetworkOptions.queue_s if queue is None else queue,
             partitions=tuple(map(parse_partition, partitions)),
         ),
         absences=(*map(parse_late, late), *map(parse_kill, kills)),
