@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.scenes import PINHOLE
-from vcl_companion.localization.coverage import covered_share, novelty_deg
+from vcl_companion.localization.coverage import covered_share
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 1.0])
@@ -21,14 +21,3 @@ def test_a_crowd_covers_no_more_than_one_of_them() -> None:
     assert covered_share(crowd, PINHOLE) == covered_share(crowd[:1], PINHOLE) == 1 / 48
     beside = np.array([[-3.0, 5.0], [5.0, PINHOLE.height_px + 2.0]])
     assert covered_share(beside, PINHOLE) == covered_share(np.zeros((0, 2)), PINHOLE) == 0.0
-
-
-def test_new_is_what_is_seen_from_aside_or_from_twice_as_near() -> None:
-    points = np.column_stack([np.full(9, 20.0), np.linspace(-1.0, 1.0, 9), np.zeros(9)])
-    origin = np.zeros((9, 3))
-    assert novelty_deg(points, np.zeros(3), origin) == 0.0
-    turn = np.deg2rad(12.0)
-    aside = np.array([20.0 * (1.0 - np.cos(turn)), 20.0 * np.sin(turn), 0.0])
-    assert novelty_deg(points, aside, origin) == pytest.approx(12.0, abs=0.3)
-    assert novelty_deg(points, np.array([10.0, 0.0, 0.0]), origin) == pytest.approx(15.0, abs=0.3)
-    assert novelty_deg(points, np.array([-20.0, 0.0, 0.0]), origin) == pytest.approx(15.0, abs=0.3)

@@ -24,11 +24,11 @@ from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.daemon.peer_clocks import PeerClocks
-from vcl_companion.localization.coverage import NEAR_DEG
 from vcl_companion.localization.detail import Detail
 from vcl_companion.localization.outlook import novelty_from
 from vcl_companion.mapping.contributing import without_alike
 from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.novelty import NEAR_DEG
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.updates import UpdateOptions, UpdateTrigger

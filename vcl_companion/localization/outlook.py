@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.localization.coverage import novelties_deg
 from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.novelty import novelties_deg
 
 # Of so many landmarks novelty is the median; less than the other tell nothing of it.
 _N_LANDMARKS, _LEAST_LANDMARKS = 200, 60

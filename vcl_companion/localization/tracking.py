@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose, adjoint
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.localization.coverage import covered_share, novelty_deg
+from vcl_companion.localization.coverage import covered_share
 from vcl_companion.localization.intra import (
     LocalizationOptions,
     Localized,
@@ -19,6 +19,7 @@ from vcl_companion.localization.intra import (
     believed,
 )
 from vcl_companion.localization.patch_pose import PatchPoses
+from vcl_companion.mapping.novelty import novelty_deg
 from vcl_companion.mapping.templates import Templates
 from vcl_companion.vision.features import Image
 from vcl_companion.vision.information import covariance_of

@@ -11,19 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.growth import Growth, Pairs
 from vcl_companion.mapping.joining import Joined
 from vcl_companion.mapping.known_features import KeyframeLibrary
 from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.partners import overlap
 from vcl_companion.mapping.tracks import PairMatches
 from vcl_companion.mapping.visibility import MutualMatches, match_features
 
 # A registered view is matched with this many keyframes that overlap it most.
 _PARTNERS = 2
-# Overlap counts fully from this angle between two rays on, and hardly where they are parallel.
-_WIDE_RAD = np.deg2rad(5.0)
 # A keyframe that looks so much elsewhere is as good as one keyframe older.
 _DEG_PER_PLACE = 15.0
 
@@ -156,12 +154,3 @@ def unique(links: PairMatches) -> PairMatches:
     """Return each pair once."""
     pairs = np.unique(np.stack([links.a, links.b], axis=1), axis=0)
     return PairMatches(pairs[:, 0], pairs[:, 1])
-
-
-def overlap(points: Array, one: Pose, other: Pose) -> float:
-    """Return how many points two cameras share, counted by the angle they are seen under."""
-    a, b = points - one.translation, points - other.translation
-    lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    cosine = np.einsum("ni,ni->n", a, b) / np.maximum(lengths, 1e-9)
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-    return float(np.minimum(angle / _WIDE_RAD, 1.0).sum())

@@ -16,7 +16,6 @@ import numpy as np
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.correspondences import overlap
 from vcl_companion.mapping.culling import Mask, depth_errors, fitting, placed
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.growth import Growth, keyframe_of
@@ -24,6 +23,7 @@ from vcl_companion.mapping.known_features import Index
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.new_landmarks import Shown, free_of, new_landmarks, shown, with_room
 from vcl_companion.mapping.options import MapOptions
+from vcl_companion.mapping.partners import partners
 from vcl_companion.mapping.patch_table import (
     EXACTLY,
     PatchTable,
@@ -163,19 +163,12 @@ class Extension:
         """Add landmarks that new views show and the map has not."""
         cams = self._cams(table)
         columns = [self._n_keys + i for i in joined]
-        partners = {c: self._partners(table, c, cams) for c in columns}
-        used = sorted({*columns, *(k for some in partners.values() for k in some)})
-        detector, per_cell = self._options.detectors[0], self._options.landmarks_per_cell
-        views: dict[int, Shown] = {}
-        for c in used:
-            try:
-                features = self._features_of(*self._images[c], detector)
-            except ValueError:
-                continue
-            free = shown(features, self._cameras[c])
-            views[c] = free_of(free, _seen_px(table.observed, c))
+        views = self._free(table, columns)
+        partners_of = {c: self._partners(table, c, views[c], cams) for c in views}
+        views |= self._free(table, sorted({k for some in partners_of.values() for k in some}))
+        per_cell = self._options.landmarks_per_cell
         for c in columns:
-            others = [t for t in [*columns, *partners[c]] if t != c and t in views]
+            others = [t for t in [*columns, *partners_of.get(c, [])] if t != c and t in views]
             if c not in views or not others:
                 continue
             shown_by = dict(views)
@@ -198,18 +191,22 @@ class Extension:
             views = {t: free_of(view, _seen_px(observed, t)) for t, view in views.items()}
         return table
 
-    def _partners(self, table: Table, column: int, cams: list[Pose]) -> list[int]:
-        """Return the old keyframes that share most with a view, under the widest angles."""
-        seen = np.isfinite(table.observed[:, column, 0])
-        shared = [
-            overlap(
-                self._old.points_world[seen & np.isfinite(self._old.observed_px[:, k, 0])],
-                cams[column],
-                cams[k],
-            )
-            for k in range(self._n_keys)
-        ]
-        return [int(k) for k in np.argsort(shared)[::-1][:_PARTNERS] if shared[k] > 0.0]
+    def _free(self, table: Table, columns: list[int]) -> dict[int, Shown]:
+        """Return the features of views that are no landmarks yet, where an image can be read."""
+        views: dict[int, Shown] = {}
+        for c in columns:
+            try:
+                features = self._features_of(*self._images[c], self._options.detectors[0])
+            except ValueError:
+                continue
+            views[c] = free_of(shown(features, self._cameras[c]), _seen_px(table.observed, c))
+        return views
+
+    def _partners(self, table: Table, c: int, view: Shown, cams: list[Pose]) -> list[int]:
+        """Return the old keyframes that show best what is new in a view."""
+        seen = np.isfinite(table.observed[:, c, 0])
+        known = table.observed[seen, c], table.points[seen]
+        return partners(view, *known, cams[c], cams[: self._n_keys], self._cameras, _PARTNERS)
 
     def _adjusted(self, table: Table, turn: int) -> tuple[Table, Mask, float]:
         """Place, drop what misses, adjust what is left, drop again."""

@@ -73,7 +73,7 @@ class UpdateOptions:
         covered: share of the image that the map has to fill with ``enough`` landmarks or fewer;
             with four times as many, half of that.
         novelty_deg: landmarks are seen from so far aside of where they are remembered, or as
-            much nearer or farther (``localization.coverage``), before the map is extended;
+            much nearer or farther (``mapping.novelty``), before the map is extended;
             1.6 times that where it is only foreseen.
         ahead_s: a map is judged by what will be seen of it when an update, begun now, is there;
             where the last one took longer, by so much, up to twice as long.
