@@ -15,7 +15,7 @@ demo: .venv
 	@.venv/bin/python -m sitl fly demo --out out/demo --speed max
 
 test: .venv
-	@.venv/bin/python -m pytest
+	@.venv/bin/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 .venv: .venv/.installed
 
