@@ -11,9 +11,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.geometry.similarity import Similarity
+from vcl_companion.mapping.known_features import Index
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.uncertainty import MapUncertainty
 from vcl_companion.vision.information import squared_distances
@@ -158,17 +160,22 @@ def _moved_landmarks(
 
 def _same_landmarks(
     old: LandmarkMap, new: LandmarkMap, places: list[tuple[int, int]]
-) -> tuple[Array, Array]:
+) -> tuple[Index, Index]:
     """Return which landmarks of both are the same: seen where the other was, in one keyframe."""
-    pairs: dict[int, int] = {}
+    then, now = [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
     for before, after in places:
-        there = np.flatnonzero(old.seen[:, before])
-        at = {
-            px.tobytes(): int(j)
-            for j, px in zip(there, old.observed_px[there, before], strict=True)
-        }
-        for j in np.flatnonzero(new.seen[:, after]):
-            known = at.get(new.observed_px[j, after].tobytes())
-            if known is not None:
-                pairs.setdefault(known, int(j))
-    return np.fromiter(pairs.keys(), np.intp), np.fromiter(pairs.values(), np.intp)
+        there, here = np.flatnonzero(old.seen[:, before]), np.flatnonzero(new.seen[:, after])
+        _, i, j = np.intersect1d(
+            _as_one(old.observed_px[there, before]),
+            _as_one(new.observed_px[here, after]),
+            return_indices=True,
+        )
+        then.append(there[i])
+        now.append(here[j])
+    landmarks, first = np.unique(np.concatenate(then), return_index=True)
+    return landmarks, np.concatenate(now)[first]
+
+
+def _as_one(pixels: Array) -> NDArray[np.complex128]:
+    """Return (N,) numbers that are equal where (N, 2) pixels are."""
+    return np.ascontiguousarray(pixels).view(np.complex128)[:, 0]
