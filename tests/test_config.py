@@ -98,6 +98,10 @@ def test_a_mistyped_value_names_path_expected_and_got(table: dict[str, Any], mes
         ('[camera]\nsource = "stream:h:99999"', "[camera] source: expected HOST:PORT"),
         ("system_id = 4\n[swarm]\nmembers = [1, 2]", "system_id: 4 is not in swarm.members [1, 2]"),
         ("[swarm]\nknown_distances = [[1, 2]]", "swarm.known_distances[0]: expected an array of 3"),
+        (
+            '[map]\ndetectors = ["akaze", "sift", "akaze"]',
+            "[map] detectors: each once, got ['akaze', 'sift', 'akaze']",
+        ),
         ("system_id = 256", "system_id: must be in 1..255, got 256"),
         ("system_id = 0x" + "f" * 6000, "system_id: expected a 64-bit integer, got a huge integer"),
         (

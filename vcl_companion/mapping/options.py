@@ -59,6 +59,8 @@ class MapOptions:
     directory: str = ""
 
     def __post_init__(self) -> None:
+        if len(set(self.detectors)) < len(self.detectors):
+            raise ValueError(f"detectors: each once, got {list(self.detectors)}")
         if self.image_format == "av1" and not can_av1():
             raise ValueError(
                 "image_format: this OpenCV writes no AV1 images; install opencv-python-headless "
