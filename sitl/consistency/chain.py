@@ -31,8 +31,6 @@ _UPDATES = UpdateOptions()
 _ATTITUDE_DEG = 0.3
 # A prediction as a filter's between frames, 1 sigma; it is told as twice that.
 _PREDICTED = np.array([0.02] * 3 + [0.002] * 3)
-# What drones foresee before they want an update (``swarm.updates``): here it is there at once.
-_NOVELTY_DEG = 8.0
 # Frames of drones that lie no further apart than this share of a period are of one instant.
 _AT_ONCE = 0.5
 _MOST_BYTES = 1 << 20
@@ -65,9 +63,7 @@ class Chain:
         novelty_deg: how newly a map looks before it is extended.
     """
 
-    def __init__(
-        self, recording: Recording, begins: int, seed: int, novelty_deg: float = _NOVELTY_DEG
-    ) -> None:
+    def __init__(self, recording: Recording, begins: int, seed: int, novelty_deg: float) -> None:
         self._drones = recording.drones
         self._leader = [drone.name for drone in recording.drones].index(recording.leader)
         self._instants = [frame.at_ns for frame in recording.drone(recording.leader).frames]

@@ -14,6 +14,7 @@ from sitl.consistency.report import Beginning, recording_report, write_consisten
 from sitl.result_folder import result_folder
 from vcl_companion.errors import ConfigError, RecordingError
 from vcl_companion.recording import Recording, read_recording
+from vcl_companion.swarm.updates import UpdateOptions
 from vcl_companion.vision.warm_up import warm_up
 
 Told = Callable[[str], None]
@@ -31,11 +32,14 @@ class ConsistencyOptions:
     Attributes:
         starts: instants of each recording that maps begin at, at most.
         extensions: of each of these, at most.
+        novelty_deg: how newly a map looks before it is extended; the more often it is, the more
+            of its error is what its extensions have in common, and the less is told.
         seed: of the errors of attitudes and predictions.
     """
 
     starts: int = 8
     extensions: int = 5
+    novelty_deg: float = UpdateOptions().novelty_deg
     seed: int = 0
 
 
@@ -85,7 +89,7 @@ def _beginnings(recording: Recording, options: ConsistencyOptions, told: Told) -
     out = []
     for begins in np.unique(np.linspace(0, latest, options.starts).astype(int)).tolist():
         told(f"{recording.name}: maps from frame {begins} on")
-        chain = Chain(recording, begins, options.seed)
+        chain = Chain(recording, begins, options.seed, options.novelty_deg)
         looks = tuple(chain.looks(step, options.extensions))
         out.append(Beginning(begins, looks, chain.ended))
     return out

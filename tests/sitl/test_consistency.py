@@ -51,7 +51,9 @@ def test_poses_of_many_maps_err_as_much_as_they_say(
 
 def test_a_chain_of_maps_is_the_same_every_time() -> None:
     recording = read_recording(DEMO)
-    looks = [list(islice(Chain(recording, 20, seed=3).looks(8, 0), 3)) for _ in range(2)]
+    looks = [
+        list(islice(Chain(recording, 20, seed=3, novelty_deg=5.0).looks(8, 0), 3)) for _ in range(2)
+    ]
     assert [look.drone for look in looks[0]] == [0, 1, 2]
     for one, other in zip(*looks, strict=True):
         assert one.fix is not None
@@ -145,10 +147,10 @@ def test_a_drone_is_left_out_where_it_has_no_frame_or_no_truth() -> None:
     )
     few = replace(two, frames=two.frames[:30])
     recording = replace(whole, drones=(one, few, replace(three, truth=ends)))
-    seen = [look.drone for look in Chain(recording, 26, seed=3).looks(2, 0)]
+    seen = [look.drone for look in Chain(recording, 26, seed=3, novelty_deg=5.0).looks(2, 0)]
     assert seen[:5] == [0, 1, 2, 0, 2]
     assert set(seen[5:]) == {0}
     blind = replace(whole, drones=(replace(one, truth=ends), two, three))
-    chain = Chain(blind, 50, seed=3)
+    chain = Chain(blind, 50, seed=3, novelty_deg=5.0)
     assert list(chain.looks(2, 0)) == []
     assert "no truth of the leader's" in chain.ended
