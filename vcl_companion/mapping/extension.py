@@ -1,8 +1,8 @@
 """A map extended by views whose place on it is known already, all by patches (IV-G, issue 4).
 
 Old landmarks are found in the new views by their patches, new ones across the
-new views and the keyframes that overlap them most, one drone's own earlier ones
-among these; then old and new are adjusted together, measured again from the
+new views and the keyframes that show best what is new in them, one drone's own
+earlier ones among these; then old and new are adjusted together, measured again from the
 adjusted poses, and adjusted a last time.
 """
 
@@ -167,9 +167,9 @@ class Extension:
         partners_of = {c: self._partners(table, c, views[c], cams) for c in views}
         views |= self._free(table, sorted({k for some in partners_of.values() for k in some}))
         per_cell = self._options.landmarks_per_cell
-        for c in columns:
-            others = [t for t in [*columns, *partners_of.get(c, [])] if t != c and t in views]
-            if c not in views or not others:
+        for c, keyframes in partners_of.items():
+            others = [t for t in [*columns, *keyframes] if t != c and t in views]
+            if not others:
                 continue
             shown_by = dict(views)
             taken_px = _seen_px(table.observed, c)

@@ -9,10 +9,10 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.new_landmarks import Shown
-from vcl_companion.mapping.novelty import novelties_deg
+from vcl_companion.mapping.novelty import angles_and_novelties_deg
 
 # A point counts fully from this angle between two rays on, and hardly where they are parallel.
-_WIDE_RAD = np.deg2rad(5.0)
+_WIDE_DEG = 5.0
 # Features are found again the less the more differently they look: from so new a place, six of ten.
 _ALIKE_DEG = 12.0
 
@@ -25,7 +25,8 @@ def overlap(points: Array, one: Pose, other: Pose) -> float:
         one: where a camera is, world_from_cam.
         other: where the other is.
     """
-    return float(_widths(points, one, other).sum())
+    angles_deg, _ = angles_and_novelties_deg(points, one.translation, other.translation)
+    return float(_widths(angles_deg).sum())
 
 
 def partners(
@@ -61,9 +62,11 @@ def partners(
     for k, keyframe in enumerate(keyframes):
         pixels = cameras[k].project(keyframe.inverse().apply(points))
         inside = cameras[k].shows(pixels, 0.0)
-        newness = novelties_deg(points[inside], world_from_cam.translation, keyframe.translation)
-        alike = np.exp(-((newness / _ALIKE_DEG) ** 2) / 2.0)
-        worth[k, inside] = alike * _widths(points[inside], world_from_cam, keyframe)
+        angles_deg, novelties_deg = angles_and_novelties_deg(
+            points[inside], world_from_cam.translation, keyframe.translation
+        )
+        alike = np.exp(-((novelties_deg / _ALIKE_DEG) ** 2) / 2.0)
+        worth[k, inside] = alike * _widths(angles_deg)
     # To be found in one of them is enough: next is who shows best what the others show badly.
     chosen: list[int] = []
     best = np.zeros(len(points))
@@ -87,10 +90,6 @@ def _guessed(view: Shown, known_px: Array, known_points: Array, world_from_cam: 
     return world_from_cam.apply(rays * depths[np.asarray(nearest)][:, None])
 
 
-def _widths(points: Array, one: Pose, other: Pose) -> Array:
+def _widths(angles_deg: Array) -> Array:
     """Return (N,) what points count by the angles they are seen under, 0 to 1."""
-    a, b = points - one.translation, points - other.translation
-    lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    cosine = np.einsum("ni,ni->n", a, b) / np.maximum(lengths, 1e-9)
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-    return np.asarray(np.minimum(angle / _WIDE_RAD, 1.0))
+    return np.asarray(np.minimum(angles_deg / _WIDE_DEG, 1.0))
