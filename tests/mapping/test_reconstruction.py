@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +24,7 @@ from vcl_companion.geometry.rotation import Array, about_down, exp_so3
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.reconstruction import MapOptions, NoMap, reconstruct
-from vcl_companion.mapping.uncertainty import map_uncertainty, shared_noise_px
+from vcl_companion.mapping.uncertainty import map_uncertainty
 from vcl_companion.mapping.visibility import choose_hypothesis
 from vcl_companion.vision.essential import RelativePose
 from vcl_companion.vision.features import Features
@@ -106,10 +105,7 @@ def test_keyframes_and_landmarks_err_as_much_as_stated() -> None:
         scene = facade_scene(rng, 100, relief_m=4.0, n_views=n_views, noise_px=0.6)
         error_m = OPTIONS.distance_sigma_m * float(rng.standard_normal())
         found = built(rng, scene, distance_error_m=error_m)
-        # What is allowed for errors that neighbours share is not in this scene.
-        shared_px2 = np.mean(np.square(shared_noise_px(found)[found.seen]))
-        alone_px = math.sqrt(found.pixel_noise_px**2 - shared_px2)
-        uncertainty = map_uncertainty(replace(found, pixel_noise_px=alone_px))
+        uncertainty = map_uncertainty(found)
         i = n_views - 1
         truth = world_from_scene() @ scene.bodies[i]
         poses.append(truth.local(found.keyframes[i].world_from_body))

@@ -17,32 +17,22 @@ from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import adjoint
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.misplacement import N_FIELDS, noise_px, smooth_px
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
-from vcl_companion.vision.bundle import Distance, Views, normal_equations
+from vcl_companion.vision.bundle import Distance, Views, linearized, normal_equations
 from vcl_companion.vision.information import covariance_of
 from vcl_companion.vision.schur import carried, eliminated
 
 # Smallest eigenvalue of an information matrix with ones on its diagonal; eliminating
 # landmarks of little parallax leaves 1e-12 by rounding.
 _SINGULAR = 1e-11
-# What displaces a feature or a patch is alike in neighbouring ones, so that residuals tell too
-# little of it: it acts on keyframes like so much more independent noise. There is hardly any
-# between like views, and the more, the farther aside of the others one is: not in proportion, for
-# what stands out, and what a surface mirrors, are then seen otherwise altogether. And from one look
-# at a landmark to the next it does not change its sign: a further one tells the less, the more
-# rounds have seen it before. Poses' NEES is so on rendered flights and on photographs.
-SHARED_NOISE_PX = 0.085
-ASIDE_NOISE_PX = 0.3
-"""At ``ASIDE_DEG``; elsewhere by the power of 1.5 of the angle."""
-ASIDE_DEG = 10.0
-REPEATED_NOISE_PX = 0.31
 _WIDER = 3.5
 # No distance between drones is known better; much smaller sigmas overflow.
 _FINEST_M = 1e-6
 # So many landmarks are dealt with at a time: on its way what is known of one takes ten times the
 # memory that it takes in the end.
-_AT_A_TIME = 256
+_AT_A_TIME = 192
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,24 +108,34 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
     # map of many keyframes, and a millionth of it is no matter.
     lever = np.empty((n, 3, 6 * n_keyframes), dtype=np.float32)
     reduced = np.zeros((6 * n_keyframes, 6 * n_keyframes))
+    pulls = np.zeros((6 * n_keyframes, N_FIELDS))
     with np.errstate(all="ignore"):
         # Distances enter in units of their own sigma; pixels in px: bring both to sigmas.
         for some in _portions(n):
             part = _of(landmark_map, some)
             views = views_of(part)
-            noise_px = np.hypot(part.pixel_noise_px, shared_noise_px(part))
-            scaled = replace(views, slopes=views.slopes / noise_px[..., None, None])
+            noise = noise_px(part)
+            scaled = replace(views, slopes=views.slopes / noise[..., None, None])
             system = normal_equations(scaled, None)
             inverse[some] = _inverse(system.point_block)
             lever[some] = -np.swapaxes(system.cross @ inverse[some], 1, 2)
             reduced += system.pose_block - eliminated(system.cross, inverse[some], system.seen)
+            of_poses, of_points = _pulls(scaled, part, noise)
+            moved = inverse[some] @ of_points
+            pulls += of_poses - np.tensordot(system.cross, moved, axes=((0, 2), (0, 1)))
         covariance = np.zeros_like(reduced)
         covariance[6:, 6:] = _inverse(reduced[6:, 6:])
+        # An adjustment that knows nothing of what errs in common is moved by it: considered, not
+        # estimated (Bierman, Factorization Methods for Discrete Sequential Estimation, VIII).
+        carried_off = covariance @ pulls
+        covariance += carried_off @ carried_off.T
         if landmark_map.anchor_covariance.any():
             # Whatever the first keyframe is off by, all are, and so are the landmarks.
             bodies = [keyframe.world_from_body for keyframe in landmark_map.keyframes]
             alike = np.vstack([adjoint(body.inverse() @ bodies[0]) for body in bodies])
             covariance += alike @ landmark_map.anchor_covariance @ alike.T
+    if not np.all(np.isfinite(covariance)):
+        raise ValueError("the map's observations do not fix it")
     return MapUncertainty(covariance, inverse, lever)
 
 
@@ -149,41 +149,32 @@ def _of(landmark_map: LandmarkMap, some: slice) -> LandmarkMap:
     )
 
 
-def shared_noise_px(landmark_map: LandmarkMap) -> Array:
-    """Return (N, V) what observations err by alike in neighbouring ones, px, 1 sigma."""
-    rounds, seen = _rounds(landmark_map.keyframes), landmark_map.seen
-    in_round = np.zeros((len(seen), rounds[-1] + 1), dtype=np.int64)
-    for i, k in enumerate(rounds):
-        in_round[:, k] |= seen[:, i]
-    before = (np.cumsum(in_round, axis=1) - in_round)[:, rounds]
-    aside_px = ASIDE_NOISE_PX * (_aside_deg(landmark_map) / ASIDE_DEG) ** 1.5
-    return np.asarray(np.sqrt(SHARED_NOISE_PX**2 + aside_px**2 + REPEATED_NOISE_PX**2 * before))
+def _pulls(views: Views, landmark_map: LandmarkMap, noise: Array) -> tuple[Array, Array]:
+    """Return what all that errs in common adds to the normal equations' right-hand sides.
 
+    Args:
+        views: of the map, in units of the noise.
+        landmark_map: V views, N landmarks.
+        noise: (N, V) px.
 
-def _aside_deg(landmark_map: LandmarkMap) -> Array:
-    """Return (N, V) how far each line of sight to a landmark lies aside of their mean, degrees."""
-    cams = [k.world_from_body @ k.body_from_cam for k in landmark_map.keyframes]
-    sight = landmark_map.points_world[:, None] - np.stack([cam.translation for cam in cams])
-    sight /= np.linalg.norm(sight, axis=2, keepdims=True)
-    mean = np.where(landmark_map.seen[..., None], sight, 0.0).sum(axis=1)
-    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
-    return np.asarray(np.rad2deg(np.arccos(np.clip(np.einsum("nvi,ni->nv", sight, mean), -1, 1))))
-
-
-def _rounds(keyframes: tuple[Keyframe, ...]) -> list[int]:
-    """Return in which round each of V keyframes came; each drone has a clock of its own.
-
-    They are in the order in which they came, and a round has one of each drone; the earlier
-    frames of one that was lost count as rounds of their own.
+    Returns:
+        (6V, F) for the poses, (N, 3, F) for the landmarks, of F causes.
     """
-    out: list[int] = []
-    there: set[int] = set()
-    for keyframe in keyframes:
-        if keyframe.drone_id in there:
-            there.clear()
-        out.append((out[-1] if out else -1) + (not there))
-        there.add(keyframe.drone_id)
-    return out
+    n, v = noise.shape
+    poses, points = np.zeros((6 * v, N_FIELDS)), np.zeros((n, 3, N_FIELDS))
+    for i, errors_px in enumerate(smooth_px(landmark_map)):
+        seen = np.flatnonzero(landmark_map.seen[:, i])
+        _, by_pose, by_point = linearized(
+            views.bodies[i],
+            views.mountings[i],
+            views.slopes[seen, i],
+            views.points[seen],
+            views.ideal[seen, i],
+        )
+        errors = errors_px[seen] / noise[seen, i, None, None]
+        poses[6 * i : 6 * i + 6] = by_pose.reshape(-1, 6).T @ errors.reshape(-1, N_FIELDS)
+        points[seen] += np.swapaxes(by_point, 1, 2) @ errors
+    return poses, points
 
 
 def _inverse(information: Array) -> Array:
