@@ -29,6 +29,8 @@ from vcl_companion.recording import read_recording
 from vcl_companion.wire.warm_up import warm_up
 
 _ANSWER_TIMEOUT_S = 60.0
+_MAP_TIMEOUT_S = 30.0
+_LOOK_S = 0.03
 
 Progress = Callable[[str, int, int], None]
 """Is told what is being done, how many frames are through, and of how many."""
@@ -163,12 +165,14 @@ async def _play(
     n_frames = sum(map(len, frames_at_ns))
     n_given = 0
     begun_s = time.monotonic()
+    maps = _Maps()
     pace = Pace(speed, moments[0].at_ns, begun_s)
     for k, moment in enumerate(moments):
         if shots.is_over(swarm):
             break
         if flat_out and moment.frames and k > holds_after:
             await _all_answered(swarm)
+            await maps.come_into_use(swarm)
         await asyncio.sleep(max(0.0, pace.wait_s(moment.at_ns, time.monotonic())))
         await swarm.kill_and_start(moment.at_ns)
         held_before_s = shots.held_s
@@ -226,6 +230,32 @@ async def _first_map(plan: FlightPlan, swarm: Swarm, conduct: Conduct) -> None:
             if drone.camera.unanswered():
                 why = f"first frame not answered within {timeout_s:.0f} s; flown on without"
                 conduct.events.append(Event(0.0, drone.planned.name, "harness", why))
+
+
+class _Maps:
+    """Where the daemons set the pace, maps are made in no time: the outcome hangs on no machine."""
+
+    def __init__(self) -> None:
+        self._is_waited_for = True
+
+    async def come_into_use(self, swarm: Swarm) -> None:
+        """Wait until no daemon has anything to do with a map; not again for one that does not come.
+
+        Raises:
+            FlightError: a daemon hung up.
+        """
+        until_s = time.monotonic() + _MAP_TIMEOUT_S
+        while await _is_any_busy(swarm):
+            if not self._is_waited_for or time.monotonic() >= until_s:
+                self._is_waited_for = False
+                return
+            await asyncio.sleep(_LOOK_S)
+        self._is_waited_for = True
+
+
+async def _is_any_busy(swarm: Swarm) -> bool:
+    cameras = [drone.camera for drone in swarm.drones if drone.camera.is_connected]
+    return any(await asyncio.gather(*(camera.is_busy() for camera in cameras)))
 
 
 async def _all_answered(swarm: Swarm) -> None:

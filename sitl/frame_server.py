@@ -10,9 +10,11 @@ import asyncio
 from sitl.processes import FlightError
 from vcl_companion.cameras.source import Outcome
 from vcl_companion.cameras.stream import (
+    Answer,
     Record,
     StreamEnd,
     StreamFrame,
+    StreamQuestion,
     StreamTime,
     encode_record,
     read_answer,
@@ -38,6 +40,9 @@ class FrameServer:
         self.outcomes: dict[int, Outcome] = {}
         self.given: list[int] = []
         self._open: set[int] = set()
+        self._n_asked = 0
+        self._at_ns = 0
+        self._busy: dict[int, bool | None] = {}  # None: has been asked
         self._server: asyncio.Server | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._changed = asyncio.Condition()
@@ -70,13 +75,34 @@ class FrameServer:
         Raises:
             FlightError: the daemon hung up, or does not read what it is given.
         """
+        self._at_ns = at_ns
         self._send(StreamFrame(sequence, at_ns, image_bytes))
         self.given.append(sequence)
         self._open.add(sequence)
 
     def tell_time(self, at_ns: int) -> None:
         """Move the daemon's clock on."""
+        self._at_ns = at_ns
         self._send(StreamTime(at_ns))
+
+    async def is_busy(self) -> bool:
+        """Ask the daemon whether a map is being made or on its way, and wait for its answer.
+
+        Raises:
+            FlightError: the daemon hung up or broke the protocol before.
+        """
+        self._n_asked += 1
+        number = self._n_asked
+        self._busy[number] = None
+        self._send(StreamQuestion(number, self._at_ns))
+        async with self._changed:
+            await self._changed.wait_for(
+                lambda: self._failure is not None or self._busy[number] is not None
+            )
+        answer = self._busy.pop(number)
+        if answer is None:
+            raise FlightError(self._failure or "")
+        return answer
 
     def say_end(self, at_ns: int) -> None:
         """Say that no frame follows."""
@@ -133,7 +159,7 @@ class FrameServer:
         failure = f"daemon of {self.drone} closed its camera stream"
         try:
             while (answer := await read_answer(reader)) is not None:
-                await self._take(answer.sequence, answer.outcome)
+                await self._take(answer)
         except (WireError, OSError) as error:
             failure = f"daemon of {self.drone}, camera stream: {error}"
         finally:
@@ -142,10 +168,16 @@ class FrameServer:
                 self._changed.notify_all()
             writer.transport.abort()
 
-    async def _take(self, sequence: int, outcome: Outcome) -> None:
-        if sequence not in self._open:
-            raise WireError(f"answers frame {sequence}, which is not waiting for one")
+    async def _take(self, answer: Answer) -> None:
+        number, word = answer.sequence, answer.outcome
         async with self._changed:
-            self._open.remove(sequence)
-            self.outcomes[sequence] = outcome
+            match word:
+                case "busy" | "idle" if self._busy.get(number, False) is None:
+                    self._busy[number] = word == "busy"
+                case "localized" | "refused" | "dropped" if number in self._open:
+                    self._open.remove(number)
+                    self.outcomes[number] = word
+                case _:
+                    what = "question" if word in ("busy", "idle") else "frame"
+                    raise WireError(f"answers {what} {number}, which is not waiting for one")
             self._changed.notify_all()

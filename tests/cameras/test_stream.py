@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from vcl_companion.cameras.source import Frame, Outcome
+from vcl_companion.cameras.source import Frame
 from vcl_companion.cameras.stream import (
     MAX_IMAGE_BYTES,
     Answer,
@@ -19,7 +19,9 @@ from vcl_companion.cameras.stream import (
     StreamCamera,
     StreamEnd,
     StreamFrame,
+    StreamQuestion,
     StreamTime,
+    Word,
     decode_image,
     encode_answer,
     encode_record,
@@ -36,8 +38,11 @@ RECORDS: st.SearchStrategy[Record] = st.one_of(
     st.builds(StreamFrame, SEQUENCES, INSTANTS, st.binary(min_size=1, max_size=64)),
     st.builds(StreamTime, INSTANTS),
     st.builds(StreamEnd, INSTANTS),
+    st.builds(StreamQuestion, SEQUENCES, INSTANTS),
 )
-OUTCOMES: st.SearchStrategy[Outcome] = st.sampled_from(("localized", "refused", "dropped"))
+WORDS: st.SearchStrategy[Word] = st.sampled_from(
+    ("localized", "refused", "dropped", "idle", "busy")
+)
 
 
 def reader_of(data: bytes) -> asyncio.StreamReader:
@@ -75,9 +80,9 @@ def test_record_round_trip(record: Record) -> None:
     assert parsed(encode_record(record)) == record
 
 
-@given(SEQUENCES, OUTCOMES)
-def test_answer_round_trip(sequence: int, outcome: Outcome) -> None:
-    assert answered(encode_answer(Answer(sequence, outcome))) == Answer(sequence, outcome)
+@given(SEQUENCES, WORDS)
+def test_answer_round_trip(sequence: int, word: Word) -> None:
+    assert answered(encode_answer(Answer(sequence, word))) == Answer(sequence, word)
 
 
 def test_golden_bytes() -> None:
@@ -90,7 +95,11 @@ def test_golden_bytes() -> None:
     assert encode_record(StreamEnd(3)).hex() == (
         "56434c46010300000000000000000000030000000000000000000000"
     )
+    assert encode_record(StreamQuestion(5, 3)).hex() == (
+        "56434c46010400000500000000000000030000000000000000000000"
+    )
     assert encode_answer(Answer(9, "dropped")).hex() == "56434c4101030000" + "09" + "00" * 7
+    assert encode_answer(Answer(9, "busy")).hex() == "56434c4101050000" + "09" + "00" * 7
 
 
 @given(st.binary(max_size=80))
@@ -121,6 +130,8 @@ def test_numbers_that_do_not_fit_are_not_sent() -> None:
         encode_record(StreamFrame(0, 1, b""))
     with pytest.raises(ValueError, match="does not fit"):
         encode_record(StreamTime(2**63))
+    with pytest.raises(ValueError, match="does not fit"):
+        encode_record(StreamQuestion(2**64, 1))
 
 
 def test_answers_end_between_answers_only() -> None:

@@ -84,6 +84,7 @@ def test_a_daemon_that_hangs_up_is_told_from_one_that_is_slow() -> None:
     [
         (encode_answer(Answer(7, "localized")), "answers frame 7"),
         (encode_answer(Answer(0, "localized")) * 2, "answers frame 0"),
+        (encode_answer(Answer(0, "idle")), "answers question 0"),
         (b"HTTP/1.1 200 OK\r\n", "not an answer"),
     ],
 )
@@ -100,6 +101,31 @@ def test_answers_that_cannot_be_are_refused(answers: bytes, message: str) -> Non
         writer.close()
         with suppress(OSError):
             await reader.read()
+        await server.close()
+
+    soon(work())
+
+
+def test_a_daemon_is_asked_whether_it_is_busy_and_one_that_hangs_up_is_not_waited_for() -> None:
+    async def work() -> None:
+        server, clock = FrameServer("mav0"), ManualClock()
+        camera = StreamCamera("127.0.0.1", await server.start(), (8, 6), clock)
+        frames = camera.frames()
+        first = asyncio.ensure_future(anext(frames))
+        await server.connected()
+        server.give(0, 100, png())
+        await first
+        following = asyncio.ensure_future(anext(frames))
+        assert not await server.is_busy()
+        camera.is_busy = lambda: True
+        assert all(await asyncio.gather(server.is_busy(), server.is_busy()))
+        assert clock.now_ns() == 100
+        assert server.unanswered() == [0]
+        await camera.close()
+        with pytest.raises(FlightError, match="closed its camera stream"):
+            await server.is_busy()
+        with pytest.raises(StopAsyncIteration):
+            await following
         await server.close()
 
     soon(work())

@@ -7,11 +7,11 @@ Both directions live here, so that the simulator and the daemon share one table
 to daemon           ``<4sBBHQQI`` then payload
 magic       4s      ``VCLF``
 version     u8      1
-kind        u8      1 frame, 2 time (the clock moves on), 3 end
+kind        u8      1 frame, 2 time (the clock moves on), 3 end, 4 question
 reserved    u16     0
-sequence    u64     of the frame; 0 for kinds 2 and 3
+sequence    u64     of the frame; 0 for kinds 2 and 3; any number for 4
 at_ns       u64     mid-exposure of the frame; the time; below 2**63
-length      u32     payload bytes, at most 16 MiB; 0 for kinds 2 and 3
+length      u32     payload bytes, at most 16 MiB; 0 for kinds 2 to 4
 payload     bytes   the image as PNG, JPEG or WebP
 ==========  ======  =====================================================
 
@@ -19,9 +19,11 @@ payload     bytes   the image as PNG, JPEG or WebP
 from daemon           ``<4sBBHQ``
 magic         4s      ``VCLA``
 version       u8      1
-outcome       u8      1 localized, 2 refused, 3 dropped
+outcome       u8      of a frame: 1 localized, 2 refused, 3 dropped;
+                      to a question, whether a map is being made or
+                      on its way: 4 no, 5 yes
 reserved      u16     0
-sequence      u64     of the frame this answers
+sequence      u64     of the frame or the question that this answers
 ============  ======  ==============================================
 """
 
@@ -30,9 +32,10 @@ from __future__ import annotations
 import asyncio
 import struct
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -47,8 +50,9 @@ MAX_IMAGE_BYTES = 16 * 1024 * 1024
 _RECORD = struct.Struct("<4sBBHQQI")
 _ANSWER = struct.Struct("<4sBBHQ")
 _RECORD_MAGIC, _ANSWER_MAGIC, _VERSION = b"VCLF", b"VCLA", 1
-_FRAME, _TIME, _END = 1, 2, 3
-_CODES: dict[Outcome, int] = {"localized": 1, "refused": 2, "dropped": 3}
+_FRAME, _TIME, _END, _QUESTION = 1, 2, 3, 4
+Word = Outcome | Literal["idle", "busy"]
+_CODES: dict[Word, int] = {"localized": 1, "refused": 2, "dropped": 3, "idle": 4, "busy": 5}
 _OUTCOMES = {code: outcome for outcome, code in _CODES.items()}
 _END_OF_TIME_NS = 2**63
 
@@ -80,14 +84,22 @@ class StreamEnd:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What became of the frame numbered ``sequence``."""
+class StreamQuestion:
+    """Whether a map is being made or on its way, while time stands at ``at_ns``."""
 
     sequence: int
-    outcome: Outcome
+    at_ns: int
 
 
-Record = StreamFrame | StreamTime | StreamEnd
+@dataclass(frozen=True)
+class Answer:
+    """What became of the frame numbered ``sequence``, or what the question of that number asks."""
+
+    sequence: int
+    outcome: Word
+
+
+Record = StreamFrame | StreamTime | StreamEnd | StreamQuestion
 
 
 def encode_record(record: Record) -> bytes:
@@ -107,6 +119,10 @@ def encode_record(record: Record) -> bytes:
             return _header(_TIME, 0, at_ns, 0)
         case StreamEnd(at_ns):
             return _header(_END, 0, at_ns, 0)
+        case StreamQuestion(sequence, at_ns):
+            if not 0 <= sequence < 2**64:
+                raise ValueError(f"question {sequence} does not fit")
+            return _header(_QUESTION, sequence, at_ns, 0)
 
 
 def _header(kind: int, sequence: int, at_ns: int, length: int) -> bytes:
@@ -132,6 +148,8 @@ async def read_record(reader: asyncio.StreamReader) -> Record:
             return StreamFrame(sequence, at_ns, await reader.readexactly(length))
     except asyncio.IncompleteReadError as cut:
         raise WireError("ended without an end record") from cut
+    if kind == _QUESTION and length == 0:
+        return StreamQuestion(sequence, at_ns)
     if (sequence, length) != (0, 0) or kind not in (_TIME, _END):
         raise WireError(f"no such record: kind {kind}, sequence {sequence}, {length} bytes")
     return StreamTime(at_ns) if kind == _TIME else StreamEnd(at_ns)
@@ -194,6 +212,8 @@ class StreamCamera:
         self._writer: asyncio.StreamWriter | None = None
         self._unanswered: set[int] = set()
         self._closed = False
+        self.is_busy: Callable[[], bool] = lambda: False
+        """What a question is answered by."""
 
     async def frames(self) -> AsyncIterator[Frame]:
         """Connect and yield until the end record; see ``CameraSource``."""
@@ -204,6 +224,9 @@ class StreamCamera:
                 received_at_ns = time.monotonic_ns()
                 self._tell_clock(record.at_ns)
                 if isinstance(record, StreamTime):
+                    continue
+                if isinstance(record, StreamQuestion):
+                    self._say(record.sequence, "busy" if self.is_busy() else "idle")
                     continue
                 if record.sequence <= sequence or record.at_ns <= at_ns:
                     raise WireError(f"frame {record.sequence} does not follow frame {sequence}")
@@ -232,8 +255,7 @@ class StreamCamera:
         if sequence not in self._unanswered:
             raise ValueError(f"frame {sequence} is not waiting for an answer")
         self._unanswered.remove(sequence)
-        if self._writer is not None and not self._writer.is_closing():
-            self._writer.write(encode_answer(Answer(sequence, outcome)))
+        self._say(sequence, outcome)
 
     async def close(self) -> None:
         """Send what is still to be sent and hang up."""
@@ -243,6 +265,10 @@ class StreamCamera:
             writer.close()
             with suppress(OSError):
                 await writer.wait_closed()
+
+    def _say(self, sequence: int, word: Word) -> None:
+        if self._writer is not None and not self._writer.is_closing():
+            self._writer.write(encode_answer(Answer(sequence, word)))
 
     def _tell_clock(self, at_ns: int) -> None:
         if isinstance(self._clock, ManualClock):

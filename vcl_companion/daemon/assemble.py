@@ -19,6 +19,7 @@ import numpy as np
 
 from vcl_companion.cameras.mounting import mounting_text, read_calibration
 from vcl_companion.cameras.open import open_camera
+from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import Clock, ManualClock, SystemClock
 from vcl_companion.config import Config
 from vcl_companion.daemon import notify
@@ -239,6 +240,8 @@ async def _run(config: Config) -> int:
         disk,
     )
     exchange.attach(peers)
+    if isinstance(camera, StreamCamera):
+        camera.is_busy = exchange.is_busy
     saved = SavedMap(maps, exchange.go_back_to, estimator, disk, autopilot, log)
     requests = MessageRequests(autopilot, OnboardComputer(Path()), disk)
     commands = Commands(autopilot, exchange, maps, estimator, teller, saved, requests, log)

@@ -383,5 +383,16 @@ class Exchange:
         """How far the update is that this drone makes, percent; 255 where it makes none."""
         return self._rounds.progress
 
+    def is_busy(self) -> bool:
+        """Return whether a map is being made or on its way, or a vote for one may be."""
+        now_s = self._now_s()
+        self._own_state.poll(now_s)
+        return (
+            self._rounds.is_coming
+            or self._sharing.is_merging
+            or bool(self._group.lacking())
+            or self._own_state.is_undecided(now_s)
+        )
+
     def _now_s(self) -> float:
         return asyncio.get_running_loop().time()

@@ -131,6 +131,7 @@ class MapRounds:
         self._options = options
         self._gathering = Gathering(group, ask, clock, clocks, rng)
         self._trigger = UpdateTrigger(options.update, group)
+        self._tried: Frame | None = None
         self._claimed_since_s: float | None = None
         self._complete_since_s: float | None = None
         self.is_asked = False
@@ -143,6 +144,13 @@ class MapRounds:
         """Whether an update is being made, from its first frame to what is decided of it."""
         return self.progress != _NO_UPDATE
 
+    @property
+    def is_coming(self) -> bool:
+        """Whether an update is under way, or about to begin with the newest frame."""
+        frame = self._frames.newest
+        is_new = frame is not None and frame is not self._tried
+        return self.is_under_way or (is_new and self._trigger.is_coming)
+
     def take(self, peer: int, frame: FrameAnswer) -> str | None:
         """Take a peer's frame; return why it is refused, if it is."""
         refusal = self._gathering.take(peer, frame)
@@ -153,17 +161,16 @@ class MapRounds:
     async def run(self) -> None:
         """Make rounds until cancelled; each needs a frame that was not tried before."""
         began_at_s = self._now_s()
-        tried: Frame | None = None
         while True:
             self._trigger.poll(self._now_s())
             stored, frame = self._maps.current, self._frames.newest
-            if frame is None or frame is tried or self._is_stale(frame):
+            if frame is None or frame is self._tried or self._is_stale(frame):
                 await asyncio.sleep(_LOOK_S)
             elif stored is None and self._is_first_due(began_at_s):
-                tried = frame
+                self._tried = frame
                 await self._first_map(frame)
             elif stored is not None and self._is_due():
-                tried = frame
+                self._tried = frame
                 try:
                     await self._next_revision(stored, frame)
                 finally:

@@ -22,6 +22,8 @@ _AT_REST_S = 2.0
 _NEWS_SHARE = 0.1
 # Who joins is told soon, and all who join meanwhile with it: a group starts at one time.
 _TO_NEW_S = 0.2
+# By then a vote has come to all.
+_HEARD_S = 0.3
 
 
 class OwnState:
@@ -58,6 +60,7 @@ class OwnState:
         self._sensor = sensor
         self._vote = OwnVote(options, self._novelty_ahead_deg)
         self._wants_update = False
+        self._wants_since_s = float("-inf")
         self.is_asked_for_update = False
         """Whether the ground wants the map updated: then so do we."""
         self._has_joined = False  # somebody, who has not been told our state since
@@ -88,6 +91,12 @@ class OwnState:
             self._told_at_s, self._told_lead = now_s, lead
             self._has_joined = False
             self.tell()
+
+    def is_undecided(self, now_s: float) -> bool:
+        """Return whether our vote may change by what is seen now, or was not heard of yet."""
+        if self._wants_update:
+            return now_s < self._wants_since_s + _HEARD_S
+        return self._vote.is_open(now_s)
 
     def tell(self) -> None:
         """Tell our state at once."""
@@ -130,6 +139,8 @@ class OwnState:
                     "vote", f"the map is to be updated: {', '.join(self._vote.reasons)}"
                 )
         self._wants_update |= self.is_asked_for_update and stored is not None
+        if self._wants_update and not before:
+            self._wants_since_s = now_s
         return self._wants_update != before
 
     def _novelty_ahead_deg(self, ahead_s: float) -> float | None:

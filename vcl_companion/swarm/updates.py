@@ -190,6 +190,7 @@ class OwnVote:
         self._revision = b""
         self._seen: deque[tuple[float, Sight]] = deque()
         self._since_s = 0.0
+        self._newest_since_s = -math.inf
         self._most = 0.0
         self._most_covered = 0.0
         self._least_sigma_m = math.inf
@@ -237,6 +238,8 @@ class OwnVote:
             self._since_s = now_s
             self._most = self._most_covered = 0.0
             self._least_sigma_m = math.inf
+        if not self._seen or sight != self._seen[-1][1]:
+            self._newest_since_s = now_s
         at_s = now_s
         if self._seen and now_s < self._seen[-1][0] + _LOOKS_APART_S:
             at_s, _ = self._seen.pop()
@@ -265,6 +268,14 @@ class OwnVote:
         """Vote while no frame has been looked at on the map in use: nobody knows what it lacks."""
         self.reasons = ()
         return False
+
+    def is_open(self, now_s: float) -> bool:
+        """Return whether a window of what is seen now may be a reason, and is not one yet."""
+        if self.reasons or not self._seen or now_s >= self._newest_since_s + _WINDOW_S:
+            return False
+        options, (_, sight) = self.options, self._seen[-1]
+        least = max(options.tracked, options.share * min(self._most, options.enough))
+        return sight.tracked < least or sight.novelty_deg > options.novelty_deg
 
     def _is_little(self) -> bool:
         # Half of the window does not outvote the other half.
@@ -390,6 +401,12 @@ class UpdateTrigger:
         if now_s < max(self._ended_at_s, self._revision_since_s) + pause_s:
             return False
         return not group.lacking() or now_s >= self._revision_since_s + options.delivery_wait_s
+
+    @property
+    def is_coming(self) -> bool:
+        """Whether a round of ours is wanted that need not wait for longer than all have to."""
+        is_wanted = self._group.is_coordinator and self._wanted_since_s is not None
+        return is_wanted and self._n_in_vain <= 1
 
     def lost(self, now_s: float) -> tuple[int, ...]:
         """Return the members that hold the map and have not localized in it for a while."""
