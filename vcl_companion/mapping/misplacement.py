@@ -21,7 +21,7 @@ LEAST_NOISE_PX = 0.03
 ASIDE_NOISE_PX = 0.3
 """At ``ASIDE_DEG``; elsewhere by the power of 1.5 of the angle."""
 ASIDE_DEG = 10.0
-SMOOTH_PX = 0.08
+SMOOTH_PX = 0.1
 """At the image's border, of one of its parts, after moving as far as a landmark is away."""
 N_FIELDS = 18
 
