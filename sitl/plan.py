@@ -42,7 +42,8 @@ class FlyOptions:
     """How a recording is flown.
 
     Attributes:
-        speed: recording seconds per wall second; infinite: as fast as all daemons keep up.
+        speed: recording seconds per wall second; infinite: as fast as all daemons keep up, their
+            maps included.
         attitude: output folder of an earlier flight whose attitude streams are sent again.
         known_distances: instead of the recording's; a pair without metres is taken
             from the truth at the start.

@@ -41,7 +41,8 @@ speed_option = click.option(
     show_default=True,
     metavar="X|max",
     callback=speed,
-    help="Seconds of the flight per second, or max: as fast as all daemons keep up.",
+    help="Seconds of the flight per second, or max: as fast as all daemons keep up, their maps "
+    "included.",
 )
 drones_option = click.option(
     "--drones", default="", metavar="mav0,mav1", help="Only these fly; otherwise all of them."

@@ -223,6 +223,7 @@ class Flyer(Drone):
         size_px = (sensor.camera.width_px, sensor.camera.height_px)
         port = await self.camera.start()
         source = StreamCamera("127.0.0.1", port, size_px, self.clock)
+        source.is_busy = self.exchange.is_busy
         with ThreadPoolExecutor(1) as executor:
             health = Health(self.autopilot_link, self.log)
             companion = Companion(

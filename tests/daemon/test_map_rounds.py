@@ -71,12 +71,16 @@ def test_a_swarm_in_flight_gets_a_new_map_and_nobody_jumps(tmp_path: Path) -> No
             await asyncio.gather(*(drone.fly(0) for drone in drones))
             first = one.revision
             assert {drone.revision for drone in drones} == {first}
+            assert not any([await drone.camera.is_busy() for drone in drones])
             switched_at = 0
             for k in (6, 12, 18, *range(24, 40, 2)):
                 await asyncio.gather(*(drone.fly(k) for drone in drones))
                 await passes(0.75)
                 if one.events("update") and not switched_at:
-                    await computed(lambda: {first}.isdisjoint(d.revision for d in drones))
+                    # Whoever waits until nobody is busy with a map any more sees all on it.
+                    while any([await drone.camera.is_busy() for drone in drones]):
+                        await passes(0.05)
+                    assert {first}.isdisjoint(d.revision for d in drones)
                     switched_at = k
                 if switched_at and k >= switched_at + 6:
                     break

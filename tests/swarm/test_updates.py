@@ -450,6 +450,19 @@ def test_rounds_that_do_not_help_become_rare_until_one_helps() -> None:
     assert pauses[0] == pytest.approx(interval_s, abs=4 * STEP_S)
 
 
+def test_a_round_is_coming_from_the_majoritys_wish_on_but_for_those_that_do_not_help() -> None:
+    sky = Sky((1, 2, 3), helps=False)
+    sky.run(5.0)
+    assert not any(member.trigger.is_coming for member in sky.members.values())
+    sky.see(FEW, 1, 2, 3)
+    sky.run(5.0, lambda: sky.members[1].trigger.is_coming)
+    assert not sky.begun
+    assert [sky.members[n].trigger.is_coming for n in (1, 2, 3)] == [True, False, False]
+    sky.run(60.0)
+    assert len(sky.begun) >= 4
+    assert not sky.members[1].trigger.is_coming
+
+
 def test_who_is_on_the_move_goes_on_however_little_each_round_brings() -> None:
     sky = Sky((1, 2, 3), helps=False, moves=True)
     sky.see(FEW, 1, 2, 3)
@@ -525,6 +538,34 @@ def test_a_view_from_a_new_place_is_a_reason() -> None:
     assert not judged([known] * 40)
     assert judged([known] * 20 + [new] * 20)
     assert not judged([new] * 20 + [known] * 20)
+
+
+@pytest.mark.parametrize(
+    "newest", [Sight(FEW), Sight(PLENTY, novelty_deg=1.1 * OPTIONS.novelty_deg)]
+)
+def test_a_vote_is_open_from_the_first_look_that_may_lead_to_one_until_it_has(
+    newest: Sight,
+) -> None:
+    vote = OwnVote(OPTIONS)
+    for k in range(20):
+        vote.look(FIRST, Sight(PLENTY), k * STEP_S)
+        assert not vote.is_open(k * STEP_S)
+    votes, is_open = [], []
+    for k in range(20, 40):
+        votes.append(vote.look(FIRST, newest, k * STEP_S))
+        is_open.append(vote.is_open(k * STEP_S))
+    assert is_open[0]
+    assert not votes[0]
+    assert votes[-1]
+    # Never both, and nothing between.
+    assert [a != b for a, b in zip(votes, is_open, strict=True)] == [True] * 20
+
+
+def test_a_look_that_comes_to_nothing_is_not_open_for_ever() -> None:
+    vote = OwnVote(replace(OPTIONS, tracked=0, share=0.0))  # maps stay as they are
+    for k in range(40):
+        assert not vote.look(FIRST, Sight(PLENTY, novelty_deg=90.0), k * STEP_S)
+    assert not vote.is_open(39 * STEP_S)
 
 
 def test_a_map_that_no_frame_was_looked_at_on_is_not_voted_on() -> None:
