@@ -72,7 +72,7 @@ def daemon_config(
     if math.isinf(plan.options.speed):
         # The recording's time stands still meanwhile; the outcome must not hang on the machine.
         wiring["inter"] = {"wait_s": _FLAT_OUT_WAIT_S}
-        # Frames as fast as they can be looked at would leave maps no time at all.
+        # Frames as fast as they can be looked at would leave peers and links no time at all.
         wiring["scheduling"] = "normal"
     return with_settings(wiring, plan.options.settings)
 

@@ -165,14 +165,14 @@ async def _play(
     n_frames = sum(map(len, frames_at_ns))
     n_given = 0
     begun_s = time.monotonic()
-    maps = _Maps()
+    maps = _Maps(conduct)
     pace = Pace(speed, moments[0].at_ns, begun_s)
     for k, moment in enumerate(moments):
         if shots.is_over(swarm):
             break
         if flat_out and moment.frames and k > holds_after:
             await _all_answered(swarm)
-            await maps.come_into_use(swarm)
+            await maps.come_into_use(swarm, (moment.at_ns - plan.starts_at_ns) * 1e-9)
         await asyncio.sleep(max(0.0, pace.wait_s(moment.at_ns, time.monotonic())))
         await swarm.kill_and_start(moment.at_ns)
         held_before_s = shots.held_s
@@ -233,29 +233,42 @@ async def _first_map(plan: FlightPlan, swarm: Swarm, conduct: Conduct) -> None:
 
 
 class _Maps:
-    """Where the daemons set the pace, maps are made in no time: the outcome hangs on no machine."""
+    """Where the daemons set the pace, maps are made in no time, however slow the machine is."""
 
-    def __init__(self) -> None:
+    def __init__(self, conduct: Conduct) -> None:
+        self._conduct = conduct
         self._is_waited_for = True
 
-    async def come_into_use(self, swarm: Swarm) -> None:
+    async def come_into_use(self, swarm: Swarm, flight_s: float) -> None:
         """Wait until no daemon has anything to do with a map; not again for one that does not come.
 
         Raises:
-            FlightError: a daemon hung up.
+            FlightError: a daemon hung up, or does not answer.
         """
         until_s = time.monotonic() + _MAP_TIMEOUT_S
-        while await _is_any_busy(swarm):
-            if not self._is_waited_for or time.monotonic() >= until_s:
+        while busy := await _busy(swarm):
+            if not self._is_waited_for:
+                return
+            if time.monotonic() >= until_s:
                 self._is_waited_for = False
+                why = f"still busy with a map after {_MAP_TIMEOUT_S:.0f} s; flown on without it"
+                self._conduct.events += [Event(flight_s, name, "harness", why) for name in busy]
                 return
             await asyncio.sleep(_LOOK_S)
         self._is_waited_for = True
 
 
-async def _is_any_busy(swarm: Swarm) -> bool:
-    cameras = [drone.camera for drone in swarm.drones if drone.camera.is_connected]
-    return any(await asyncio.gather(*(camera.is_busy() for camera in cameras)))
+async def _busy(swarm: Swarm) -> list[str]:
+    """Return the names of the drones that have to do with a map."""
+    asked = [drone for drone in swarm.drones if drone.camera.is_connected]
+    try:
+        async with asyncio.timeout(_ANSWER_TIMEOUT_S):
+            answers = await asyncio.gather(*(drone.camera.is_busy() for drone in asked))
+    except TimeoutError:
+        raise FlightError(
+            f"a daemon has not said within {_ANSWER_TIMEOUT_S:.0f} s whether it makes a map"
+        ) from None
+    return [drone.planned.name for drone, busy in zip(asked, answers, strict=True) if busy]
 
 
 async def _all_answered(swarm: Swarm) -> None:

@@ -42,7 +42,7 @@ class FrameServer:
         self._open: set[int] = set()
         self._n_asked = 0
         self._at_ns = 0
-        self._busy: dict[int, bool | None] = {}  # None: has been asked
+        self._asked: dict[int, asyncio.Future[bool]] = {}
         self._server: asyncio.Server | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._changed = asyncio.Condition()
@@ -92,17 +92,10 @@ class FrameServer:
             FlightError: the daemon hung up or broke the protocol before.
         """
         self._n_asked += 1
-        number = self._n_asked
-        self._busy[number] = None
-        self._send(StreamQuestion(number, self._at_ns))
-        async with self._changed:
-            await self._changed.wait_for(
-                lambda: self._failure is not None or self._busy[number] is not None
-            )
-        answer = self._busy.pop(number)
-        if answer is None:
-            raise FlightError(self._failure or "")
-        return answer
+        answer: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
+        self._asked[self._n_asked] = answer
+        self._send(StreamQuestion(self._n_asked, self._at_ns))
+        return await answer
 
     def say_end(self, at_ns: int) -> None:
         """Say that no frame follows."""
@@ -166,14 +159,20 @@ class FrameServer:
             async with self._changed:
                 self._failure = failure
                 self._changed.notify_all()
+            for asked in self._asked.values():
+                if not asked.done():
+                    asked.set_exception(FlightError(failure))
+            self._asked.clear()
             writer.transport.abort()
 
     async def _take(self, answer: Answer) -> None:
         number, word = answer.sequence, answer.outcome
         async with self._changed:
             match word:
-                case "busy" | "idle" if self._busy.get(number, False) is None:
-                    self._busy[number] = word == "busy"
+                case "busy" | "idle" if number in self._asked:
+                    answer_to = self._asked.pop(number)
+                    if not answer_to.done():
+                        answer_to.set_result(word == "busy")
                 case "localized" | "refused" | "dropped" if number in self._open:
                     self._open.remove(number)
                     self.outcomes[number] = word

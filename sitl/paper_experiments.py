@@ -41,7 +41,7 @@ class Pipeline:
         name: key in ``paper.json`` and folder of its flights.
         title: for people.
         speed: recording seconds per wall second that it is flown at; infinite: as fast as
-            all daemons keep up, where they do not in real time.
+            all daemons and their maps keep up, where they do not in real time.
         settings: what makes a daemon localize like this.
     """
 

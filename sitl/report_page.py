@@ -132,7 +132,11 @@ _NETWORK_NOTE = (
 
 def _lead(report: Mapping[str, Any]) -> str:
     drones, options = report["drones"], report["options"]
-    pace = "as fast as all keep up" if options["speed"] == "max" else f"speed {options['speed']:g}"
+    pace = (
+        "as fast as all keep up, maps included"
+        if options["speed"] == "max"
+        else f"speed {options['speed']:g}"
+    )
     frames = sum(drone["frames"] for drone in drones.values())
     count = f"{len(drones)} drone{'s' if len(drones) > 1 else ''}"
     return f"{count}, {frames} frames in {report['duration_s']:.1f} s of flight, {pace}"

@@ -30,8 +30,8 @@ def _one_thread() -> None:
     "--speed",
     metavar="X|max",
     callback=speed,
-    help="Seconds of the recording per second, or max: as fast as all daemons keep up; "
-    "otherwise the paper's pipeline at max, the default one so that each of three drones has "
+    help="Seconds of the recording per second, or max: as fast as all daemons and their maps keep "
+    "up; otherwise the paper's pipeline at max, the default one so that each of three drones has "
     "a processor and a half of this machine, at most in real time.",
 )
 @click.option(

@@ -561,11 +561,14 @@ def test_a_vote_is_open_from_the_first_look_that_may_lead_to_one_until_it_has(
     assert [a != b for a, b in zip(votes, is_open, strict=True)] == [True] * 20
 
 
-def test_a_look_that_comes_to_nothing_is_not_open_for_ever() -> None:
-    vote = OwnVote(replace(OPTIONS, tracked=0, share=0.0))  # maps stay as they are
+def test_no_vote_is_open_where_there_is_no_map_or_maps_stay_as_they_are() -> None:
+    stays = OwnVote(replace(OPTIONS, tracked=0, share=0.0))
     for k in range(40):
-        assert not vote.look(FIRST, Sight(PLENTY, novelty_deg=90.0), k * STEP_S)
-    assert not vote.is_open(39 * STEP_S)
+        assert not stays.look(FIRST, Sight(PLENTY, novelty_deg=90.0 + k), k * STEP_S)
+        assert not stays.is_open(k * STEP_S)
+    without = OwnVote(OPTIONS)
+    without.look(b"", Sight(FEW), 0.0)
+    assert not without.is_open(0.0)
 
 
 def test_a_map_that_no_frame_was_looked_at_on_is_not_voted_on() -> None:

@@ -53,7 +53,7 @@ _RECORD_MAGIC, _ANSWER_MAGIC, _VERSION = b"VCLF", b"VCLA", 1
 _FRAME, _TIME, _END, _QUESTION = 1, 2, 3, 4
 Word = Outcome | Literal["idle", "busy"]
 _CODES: dict[Word, int] = {"localized": 1, "refused": 2, "dropped": 3, "idle": 4, "busy": 5}
-_OUTCOMES = {code: outcome for outcome, code in _CODES.items()}
+_WORDS = {code: outcome for outcome, code in _CODES.items()}
 _END_OF_TIME_NS = 2**63
 
 _CONNECT_WITHIN_S = 10.0
@@ -93,7 +93,7 @@ class StreamQuestion:
 
 @dataclass(frozen=True)
 class Answer:
-    """What became of the frame numbered ``sequence``, or what the question of that number asks."""
+    """What became of the frame numbered ``sequence``, or the answer to that question."""
 
     sequence: int
     outcome: Word
@@ -173,7 +173,7 @@ async def read_answer(reader: asyncio.StreamReader) -> Answer | None:
             raise WireError("ended in the middle of an answer") from cut
         return None
     magic, version, code, reserved, sequence = _ANSWER.unpack(data)
-    outcome = _OUTCOMES.get(code)
+    outcome = _WORDS.get(code)
     if (magic, version, reserved) != (_ANSWER_MAGIC, _VERSION, 0) or outcome is None:
         raise WireError(f"not an answer of this protocol: {data!r}")
     return Answer(sequence, outcome)

@@ -240,7 +240,7 @@ async def _run(config: Config) -> int:
         disk,
     )
     exchange.attach(peers)
-    if isinstance(camera, StreamCamera):
+    if isinstance(camera, StreamCamera):  # no other camera asks
         camera.is_busy = exchange.is_busy
     saved = SavedMap(maps, exchange.go_back_to, estimator, disk, autopilot, log)
     requests = MessageRequests(autopilot, OnboardComputer(Path()), disk)

@@ -384,9 +384,12 @@ class Exchange:
         return self._rounds.progress
 
     def is_busy(self) -> bool:
-        """Return whether a map is being made or on its way, or a vote for one may be."""
+        """Return whether a map is being extended or on its way, or a vote for that may be.
+
+        For who flies us in a simulation, and can hold the time until we are not.
+        """
         now_s = self._now_s()
-        self._own_state.poll(now_s)
+        self._own_state.poll(now_s)  # a frame may just have been answered
         return (
             self._rounds.is_coming
             or self._sharing.is_merging

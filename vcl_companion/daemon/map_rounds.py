@@ -147,9 +147,12 @@ class MapRounds:
     @property
     def is_coming(self) -> bool:
         """Whether an update is under way, or about to begin with the newest frame."""
+        return self.is_under_way or (self._untried() is not None and self._trigger.is_coming)
+
+    def _untried(self) -> Frame | None:
+        """Return our newest frame, if it may begin a round."""
         frame = self._frames.newest
-        is_new = frame is not None and frame is not self._tried
-        return self.is_under_way or (is_new and self._trigger.is_coming)
+        return None if frame is None or frame is self._tried or self._is_stale(frame) else frame
 
     def take(self, peer: int, frame: FrameAnswer) -> str | None:
         """Take a peer's frame; return why it is refused, if it is."""
@@ -163,8 +166,8 @@ class MapRounds:
         began_at_s = self._now_s()
         while True:
             self._trigger.poll(self._now_s())
-            stored, frame = self._maps.current, self._frames.newest
-            if frame is None or frame is self._tried or self._is_stale(frame):
+            stored, frame = self._maps.current, self._untried()
+            if frame is None:
                 await asyncio.sleep(_LOOK_S)
             elif stored is None and self._is_first_due(began_at_s):
                 self._tried = frame

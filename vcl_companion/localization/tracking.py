@@ -82,7 +82,7 @@ class TrackingOptions:
     misplaced_px_per_octave: float = 0.03
     misplaced_by_residual: float = 0.7
     shifted_px: float = 0.03
-    mounted_m: float = 0.0007
+    mounted_m: float = 0.0006
 
     def __post_init__(self) -> None:
         if not 20 <= self.n_coarse <= self.n_landmarks:

@@ -21,9 +21,9 @@ LEAST_NOISE_PX = 0.03
 ASIDE_NOISE_PX = 0.3
 """At ``ASIDE_DEG``; elsewhere by the power of 1.5 of the angle."""
 ASIDE_DEG = 10.0
-SMOOTH_PX = 0.1
+SMOOTH_PX = 0.09
 """At the image's border, of one of its parts, after moving as far as a landmark is away."""
-N_FIELDS = 18
+N_FIELDS = 6 * 3
 
 
 def noise_px(landmark_map: LandmarkMap) -> Array:
@@ -33,10 +33,10 @@ def noise_px(landmark_map: LandmarkMap) -> Array:
 
 
 def smooth_px(landmark_map: LandmarkMap) -> Iterator[Array]:
-    """Yield of each view (N, 2, F) by how much it errs in common, px for each 1 sigma of F causes.
+    """Yield of each view (M, 2, F) by how much it errs in common, px for each 1 sigma of F causes.
 
     An affine field over the image for each direction in which the camera moves, in proportion to
-    how far it does, measured by the distance of the landmark; NaN where one is not seen.
+    how far it does, measured by the distance of the landmark; of the M landmarks that it sees.
     """
     centres, seen = _centres(landmark_map), landmark_map.seen
     n_views = np.maximum(seen.sum(axis=1), 1)[:, None]
@@ -44,10 +44,11 @@ def smooth_px(landmark_map: LandmarkMap) -> Iterator[Array]:
     middle = (seen @ centres) / n_views
     distance = np.where(seen, away, 0.0).sum(axis=1)[:, None] / n_views
     for i, keyframe in enumerate(landmark_map.keyframes):
-        moved = SMOOTH_PX * (centres[i] - middle) / distance
+        rows = np.flatnonzero(seen[:, i])
+        moved = SMOOTH_PX * (centres[i] - middle[rows]) / distance[rows]
         half = np.array([keyframe.camera.width_px, keyframe.camera.height_px]) / 2.0
-        x, y = ((landmark_map.observed_px[:, i] - half) / half[0]).T
-        one, none = np.where(seen[:, i], 1.0, np.nan), np.where(seen[:, i], 0.0, np.nan)
+        x, y = ((landmark_map.observed_px[rows, i] - half) / half[0]).T
+        one, none = np.ones(len(rows)), np.zeros(len(rows))
         # Shifts, scale, turn, and the two kinds of shear.
         across = np.stack([one, none, x, -y, x, y], axis=1)
         down = np.stack([none, one, y, x, -y, x], axis=1)

@@ -2,9 +2,12 @@
 
 The joint covariance of keyframe poses and landmarks is the inverse of the
 bundle adjustment's normal matrix, which needs only poses, points and who saw
-what. It is kept factored: each landmark has an error of its own, and one it
+what, and what observations that err in common (``misplacement``) do to the
+poses. It is kept factored: each landmark has an error of its own, and one it
 shares with all others through the keyframe poses. The shared part does not
-average out over landmarks or frames and is what fusing must not forget.
+average out over landmarks or frames and is what fusing must not forget. What
+errs in common moves landmarks past their keyframes, too, by about as little as
+it is itself; that is left out.
 """
 
 from __future__ import annotations
@@ -162,8 +165,11 @@ def _pulls(views: Views, landmark_map: LandmarkMap, noise: Array) -> tuple[Array
     """
     n, v = noise.shape
     poses, points = np.zeros((6 * v, N_FIELDS)), np.zeros((n, 3, N_FIELDS))
+    sees = landmark_map.seen
     for i, errors_px in enumerate(smooth_px(landmark_map)):
-        seen = np.flatnonzero(landmark_map.seen[:, i])
+        seen = np.flatnonzero(sees[:, i])
+        if len(seen) == 0:
+            continue
         _, by_pose, by_point = linearized(
             views.bodies[i],
             views.mountings[i],
@@ -171,7 +177,7 @@ def _pulls(views: Views, landmark_map: LandmarkMap, noise: Array) -> tuple[Array
             views.points[seen],
             views.ideal[seen, i],
         )
-        errors = errors_px[seen] / noise[seen, i, None, None]
+        errors = errors_px / noise[seen, i, None, None]
         poses[6 * i : 6 * i + 6] = by_pose.reshape(-1, 6).T @ errors.reshape(-1, N_FIELDS)
         points[seen] += np.swapaxes(by_point, 1, 2) @ errors
     return poses, points

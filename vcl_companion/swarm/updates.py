@@ -56,6 +56,8 @@ _MAX_PAUSE = 8.0
 # for so long, s: a new map that is no better is found out in 0.5 s, and in fast flight the
 # next one is wanted after two.
 _SEES_MORE = 1.3
+# Who makes no map that helps of so many rounds is not about to.
+_TRIES = 2
 # So many times ``ahead_s`` at most: what is further ahead is not foreseen by a second's course.
 _FURTHEST = 2.0
 _CONTENT_S = 1.0
@@ -246,7 +248,7 @@ class OwnVote:
         self._seen.append((at_s, sight))
         while self._seen[0][0] < now_s - _WINDOW_S:
             self._seen.popleft()
-        if not revision or not (self.options.tracked or self.options.share):
+        if not self._may_vote():
             self.reasons = ()
         elif now_s - self._since_s >= _JUDGED_SHARE * _WINDOW_S:
             judged = {
@@ -270,21 +272,26 @@ class OwnVote:
         return False
 
     def is_open(self, now_s: float) -> bool:
-        """Return whether a window of what is seen now may be a reason, and is not one yet."""
-        if self.reasons or not self._seen or now_s >= self._newest_since_s + _WINDOW_S:
+        """Return whether few landmarks or a new view may be a reason soon, if they stay so."""
+        if self.reasons or not (self._seen and self._may_vote()):
             return False
-        options, (_, sight) = self.options, self._seen[-1]
-        least = max(options.tracked, options.share * min(self._most, options.enough))
-        return sight.tracked < least or sight.novelty_deg > options.novelty_deg
+        _, sight = self._seen[-1]
+        is_reason = sight.tracked < self._least() or sight.novelty_deg > self.options.novelty_deg
+        return is_reason and now_s < self._newest_since_s + _WINDOW_S
+
+    def _may_vote(self) -> bool:
+        return bool(self._revision) and bool(self.options.tracked or self.options.share)
+
+    def _least(self) -> float:
+        counted = min(self._most, self.options.enough)
+        return max(self.options.tracked, self.options.share * counted)
 
     def _is_little(self) -> bool:
         # Half of the window does not outvote the other half.
         seen = [(at_s, float(s.tracked)) for at_s, s in self._seen]
         lately = statistics.median_high(n for _, n in seen)
         self._most = max(self._most, lately)
-        counted = min(self._most, self.options.enough)
-        least = max(self.options.tracked, self.options.share * counted)
-        return min(lately, self._foreseen(seen, lately)) < least
+        return min(lately, self._foreseen(seen, lately)) < self._least()
 
     def _is_narrow(self) -> bool:
         known = [(at_s, s.covered) for at_s, s in self._seen if s.covered is not None]
@@ -362,6 +369,7 @@ class UpdateTrigger:
         self._lost_since_s: dict[int, float] = {}
         self._ended_at_s = -math.inf
         self._n_in_vain = 0
+        self._n_on_this = 0  # rounds since the newest revision
         self._content_since_s = math.inf
         self._told: dict[int, tuple[bytes, int]] = {}
         self._before: dict[int, int] = {}
@@ -372,6 +380,7 @@ class UpdateTrigger:
         group = self._group
         if group.newest_revision != self._revision:
             self._revision, self._revision_since_s = group.newest_revision, now_s
+            self._n_on_this = 0
         if not group.majority_wants_update:
             self._wanted_since_s = None
         elif self._wanted_since_s is None:
@@ -404,9 +413,9 @@ class UpdateTrigger:
 
     @property
     def is_coming(self) -> bool:
-        """Whether a round of ours is wanted that need not wait for longer than all have to."""
+        """Whether a round of ours is wanted and soon begun, and the last ones have helped."""
         is_wanted = self._group.is_coordinator and self._wanted_since_s is not None
-        return is_wanted and self._n_in_vain <= 1
+        return is_wanted and max(self._n_on_this, self._n_in_vain) < _TRIES
 
     def lost(self, now_s: float) -> tuple[int, ...]:
         """Return the members that hold the map and have not localized in it for a while."""
@@ -422,6 +431,7 @@ class UpdateTrigger:
                 is on the move needs the next one as much, however little each brings.
         """
         self._n_in_vain = 0 if from_new_places else self._n_in_vain + 1
+        self._n_on_this += 1
         self._ended_at_s = now_s
         self._wanted_since_s = None
 
