@@ -23,7 +23,7 @@ from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.misplacement import N_FIELDS, noise_px, smooth_px
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
-from vcl_companion.vision.bundle import Distance, Views, linearized, normal_equations
+from vcl_companion.vision.bundle import Distance, Views, normal_equations
 from vcl_companion.vision.information import covariance_of
 from vcl_companion.vision.schur import carried, eliminated
 
@@ -119,13 +119,17 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
             views = views_of(part)
             noise = noise_px(part)
             scaled = replace(views, slopes=views.slopes / noise[..., None, None])
-            system = normal_equations(scaled, None)
+            sees = part.seen
+            alike = (
+                errors_px / noise[sees[:, i], i, None, None]
+                for i, errors_px in enumerate(smooth_px(part))
+            )
+            system = normal_equations(scaled, None, alike, N_FIELDS)
             inverse[some] = _inverse(system.point_block)
             lever[some] = -np.swapaxes(system.cross @ inverse[some], 1, 2)
             reduced += system.pose_block - eliminated(system.cross, inverse[some], system.seen)
-            of_poses, of_points = _pulls(scaled, part, noise)
-            moved = inverse[some] @ of_points
-            pulls += of_poses - np.tensordot(system.cross, moved, axes=((0, 2), (0, 1)))
+            moved = inverse[some] @ system.point_pull
+            pulls += system.pose_pull - np.tensordot(system.cross, moved, axes=((0, 2), (0, 1)))
         covariance = np.zeros_like(reduced)
         covariance[6:, 6:] = _inverse(reduced[6:, 6:])
         # An adjustment that knows nothing of what errs in common is moved by it: considered, not
@@ -135,8 +139,8 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
         if landmark_map.anchor_covariance.any():
             # Whatever the first keyframe is off by, all are, and so are the landmarks.
             bodies = [keyframe.world_from_body for keyframe in landmark_map.keyframes]
-            alike = np.vstack([adjoint(body.inverse() @ bodies[0]) for body in bodies])
-            covariance += alike @ landmark_map.anchor_covariance @ alike.T
+            as_first = np.vstack([adjoint(body.inverse() @ bodies[0]) for body in bodies])
+            covariance += as_first @ landmark_map.anchor_covariance @ as_first.T
     if not np.all(np.isfinite(covariance)):
         raise ValueError("the map's observations do not fix it")
     return MapUncertainty(covariance, inverse, lever)
@@ -150,37 +154,6 @@ def _of(landmark_map: LandmarkMap, some: slice) -> LandmarkMap:
         observed_px=landmark_map.observed_px[some],
         distances=landmark_map.distances if some.start == 0 else (),
     )
-
-
-def _pulls(views: Views, landmark_map: LandmarkMap, noise: Array) -> tuple[Array, Array]:
-    """Return what all that errs in common adds to the normal equations' right-hand sides.
-
-    Args:
-        views: of the map, in units of the noise.
-        landmark_map: V views, N landmarks.
-        noise: (N, V) px.
-
-    Returns:
-        (6V, F) for the poses, (N, 3, F) for the landmarks, of F causes.
-    """
-    n, v = noise.shape
-    poses, points = np.zeros((6 * v, N_FIELDS)), np.zeros((n, 3, N_FIELDS))
-    sees = landmark_map.seen
-    for i, errors_px in enumerate(smooth_px(landmark_map)):
-        seen = np.flatnonzero(sees[:, i])
-        if len(seen) == 0:
-            continue
-        _, by_pose, by_point = linearized(
-            views.bodies[i],
-            views.mountings[i],
-            views.slopes[seen, i],
-            views.points[seen],
-            views.ideal[seen, i],
-        )
-        errors = errors_px / noise[seen, i, None, None]
-        poses[6 * i : 6 * i + 6] = by_pose.reshape(-1, 6).T @ errors.reshape(-1, N_FIELDS)
-        points[seen] += np.swapaxes(by_point, 1, 2) @ errors
-    return poses, points
 
 
 def _inverse(information: Array) -> Array:

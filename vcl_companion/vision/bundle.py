@@ -7,7 +7,9 @@ position and orientation of the frame; known distances fix the scale.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import chain, repeat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +84,8 @@ class NormalEquations:
         cross: (N, 6V, 3) pose-point coupling.
         seen: (N, V) bool, which view sees which point.
         cost: robust cost, px^2 (distances weighted to the same unit).
+        pose_pull: (6V, F) what errors of observations, of F causes, add to ``pose_rhs``.
+        point_pull: (N, 3, F) the same of ``point_rhs``.
     """
 
     pose_block: Array
@@ -91,6 +95,8 @@ class NormalEquations:
     cross: Array
     seen: NDArray[np.bool_]
     cost: float
+    pose_pull: Array
+    point_pull: Array
 
 
 def reprojection_residuals(views: Views) -> Array:
@@ -235,12 +241,17 @@ def residual_noise_px(residuals: Array) -> float:
     return float(max(np.sqrt(np.median(squared / expected)), 0.02))
 
 
-def normal_equations(views: Views, cauchy_px: float | None) -> NormalEquations:
+def normal_equations(
+    views: Views, cauchy_px: float | None, errors: Iterable[Array] = (), n_causes: int = 0
+) -> NormalEquations:
     """Linearise every observation and distance at the present estimate (eq. 4, many views).
 
     Args:
         views: where to linearise.
         cauchy_px: scale of the robust weight; None weighs all observations one.
+        errors: of each view (M, 2, F) by how much its M observations would be off by each of F
+            causes, px; none where nobody asks.
+        n_causes: F.
     """
     n, v = views.ideal.shape[:2]
     pose_block = np.zeros((6 * v, 6 * v))
@@ -248,8 +259,9 @@ def normal_equations(views: Views, cauchy_px: float | None) -> NormalEquations:
     point_block = np.zeros((n, 3, 3))
     point_rhs = np.zeros((n, 3))
     cross = np.zeros((n, 6 * v, 3))
+    pose_pull, point_pull = np.zeros((6 * v, n_causes)), np.zeros((n, 3, n_causes))
     cost = 0.0
-    for i in range(v):
+    for i, off in zip(range(v), chain(errors, repeat(None)), strict=False):
         seen = np.flatnonzero(np.isfinite(views.ideal[:, i, 0]))
         if len(seen) == 0:
             continue
@@ -272,10 +284,15 @@ def normal_equations(views: Views, cauchy_px: float | None) -> NormalEquations:
         point_block[seen] += np.swapaxes(weighted_point, 1, 2) @ j_point
         point_rhs[seen] -= np.einsum("nki,nk->ni", weighted_point, residual)
         cross[seen, block] += np.swapaxes(weighted_pose, 1, 2) @ j_point
+        if off is not None:
+            pose_pull[block] += flat @ off.reshape(-1, n_causes)
+            point_pull[seen] += np.swapaxes(weighted_point, 1, 2) @ off
     for known in views.distances:
         cost += _add_distance(views, known, pose_block, pose_rhs)
     in_view = np.ascontiguousarray(np.isfinite(views.ideal[:, :, 0]))
-    return NormalEquations(pose_block, pose_rhs, point_block, point_rhs, cross, in_view, cost)
+    return NormalEquations(
+        pose_block, pose_rhs, point_block, point_rhs, cross, in_view, cost, pose_pull, point_pull
+    )
 
 
 def linearized(
