@@ -243,3 +243,64 @@ def test_teammates_are_who_is_alive_and_says_that_it_flies_with_our_team(
                 now_s += team * 2.0
                 group.poll(now_s)
         assert group.teammates == tuple(m for m in group.alive if group.team_of(m) == group.team)
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["heard", "says", "we say", "distrusts", "apart", "waits"]),
+            st.integers(1, 4),
+            st.integers(0, 7),
+        ),
+        max_size=30,
+    )
+)
+def test_who_was_asked_all_the_time_says_the_same_as_who_was_never_asked(
+    events: list[tuple[str, int, int]],
+) -> None:
+    """What a group has once found out is found anew whenever it may be otherwise."""
+    often, once = (Group(SwarmOptions((1, 2, 3, 4)), 2) for _ in range(2))
+    now_s = 0.0
+    for what, member, bits in events:
+        now_s += 0.3
+        if what == "waits":
+            now_s += 0.7 * bits
+        state = MapState(
+            OLD.revision if bits & 1 else NEW.revision,
+            900,
+            True,
+            wants_update=bool(bits & 2),
+            team=bits >> 2,
+            world=NEW.revision,
+        )
+        for group in (often, once):
+            match what:
+                case "heard":
+                    group.heartbeat(member, now_s)
+                case "says" if member != group.own_id:
+                    group.map_state(member, state, now_s)
+                case "we say":
+                    group.set_own_state(state)
+                case "distrusts":
+                    group.distrust(frozenset({member}) if bits & 1 else frozenset())
+                case "apart":
+                    group.leave_apart(frozenset({member}) if bits & 1 else frozenset())
+                case _:
+                    group.poll(now_s)
+        found_out(often)
+    assert found_out(often) == found_out(once)
+
+
+def found_out(group: Group) -> tuple[object, ...]:
+    """Return what others ask a group for."""
+    return (
+        group.alive,
+        group.teammates,
+        group.other_teams,
+        group.coordinator,
+        group.lacking(),
+        group.wanting_update,
+        group.majority_wants_update,
+        group.contributors((), 4),
+        group.is_senior(1),
+    )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -169,3 +171,17 @@ def test_values_out_of_bounds_cannot_be_made(make: object) -> None:
     assert callable(make)
     with pytest.raises(ValueError, match=r"\w"):
         make()
+
+
+def test_a_state_that_differs_only_in_how_much_is_seen_is_no_news() -> None:
+    said = MapState(bytes(range(8)), 1000, True, 517, world=bytes(range(1, 9)))
+    assert not replace(said, tracked=3, n_landmarks=7, signature=b"seen").is_news_after(said)
+    for changed in (
+        replace(said, revision=bytes(8)),
+        replace(said, localized=False),
+        replace(said, wants_update=True),
+        replace(said, team=2),
+        replace(said, epoch=1),
+        replace(said, world=b""),
+    ):
+        assert changed.is_news_after(said)

@@ -62,7 +62,7 @@ class PeerMessages:
         """Take one payload; whatever is wrong with it is counted.
 
         Returns:
-            Whether it was one of ours, and could be read.
+            Whether there may be something to do, or to say, for it.
         """
         if not is_ours(tunnel.payload_type):
             return False
@@ -71,21 +71,21 @@ class PeerMessages:
         except WireError as error:
             self._trust.malformed(tunnel.sender_system, "payload", error)
             return False
-        self._accept(tunnel.sender_system, message, to_all=tunnel.target_system == 0)
-        return True
+        return self._accept(tunnel.sender_system, message, to_all=tunnel.target_system == 0)
 
-    def _accept(self, peer: int, message: TunnelPayload, *, to_all: bool) -> None:
+    def _accept(self, peer: int, message: TunnelPayload, *, to_all: bool) -> bool:
         if not isinstance(message, Chunk | TransferStatus):
             self._trust.heard(peer)
             if not isinstance(message, MapState) and self._trust.bars(peer, "message"):
-                return
+                return False
         match message:
             case Chunk() | TransferStatus():
                 now_s = asyncio.get_running_loop().time()
                 events = self._transfers.receive(peer, message, now_s, to_all=to_all)
                 self._deliveries.take(events)
             case MapState():
-                self._presence.map_state(peer, message)
+                # Most say what was said before, and in a large swarm that would be all the work.
+                return self._presence.map_state(peer, message)
             case FrameRequest():
                 self._answers.want(peer, message)
             case MapRefused():
@@ -95,3 +95,4 @@ class PeerMessages:
                 refusal = self._inter.take(peer, message)
                 if refusal is not None:
                     self._refusals.count(peer, refusal)
+        return True

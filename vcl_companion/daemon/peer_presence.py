@@ -52,12 +52,17 @@ class PeerPresence:
         """Note a sign of life."""
         self._note(self._group.heartbeat(peer, self._now_s()))
 
-    def map_state(self, peer: int, state: MapState) -> None:
-        """Note what a peer says of itself; who had a map and has none was restarted."""
+    def map_state(self, peer: int, state: MapState) -> bool:
+        """Note what a peer says of itself; who had a map and has none was restarted.
+
+        Returns:
+            Whether it is something else than what it said last.
+        """
         before = self._group.state_of(peer)
         if before is not None and before.revision and not state.revision:
             self._forgot(peer)
         self._note(self._group.map_state(peer, state, self._now_s()))
+        return before is None or state.is_news_after(before)
 
     def poll(self, now_s: float) -> None:
         """Note who is silent by now."""

@@ -111,6 +111,15 @@ class MapState:
                 f"a signature of {len(self.signature)} bytes, at most {SIGNATURE_BYTES}"
             )
 
+    def is_news_after(self, before: MapState) -> bool:
+        """Return whether it says more than how much is seen of the same map, and of what place."""
+        return self._course() != before._course()
+
+    def _course(self) -> tuple[object, ...]:
+        return (
+            self.revision, self.localized, self.wants_update, self.team, self.epoch, self.world
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class MapRefused:
