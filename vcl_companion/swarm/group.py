@@ -80,10 +80,6 @@ class Group:
         self._team = 0
         # Asked for with every message, and changed by hardly any; None: to be found anew.
         self._teammates: tuple[int, ...] | None = None
-        self._voters: tuple[int, ...] | None = None
-        self._known_roster: Roster | None = None
-        # Nobody of those who vote is silent, and nobody is lost, before; they may still be heard.
-        self._silent_from_s = self._lost_from_s = -math.inf
         self._epochs = Epochs(own_id)
         self._graph = OverlapGraph(self.members, OverlapOptions())
         self._parting = Parting(self._graph, options.split_after_s)
@@ -111,7 +107,6 @@ class Group:
     def distrust(self, peers: frozenset[int]) -> None:
         """Note who is not believed from now on; all others are."""
         self._distrusted = peers - {self.own_id}
-        self._look_anew()
         self._take_term()
 
     def leave_apart(self, peers: frozenset[int]) -> None:
@@ -121,7 +116,6 @@ class Group:
         give frames to it, nor are waited for to have it.
         """
         self._apart = peers - {self.own_id}
-        self._voters = None
 
     @property
     def is_complete(self) -> bool:
@@ -228,12 +222,10 @@ class Group:
         if peer == self.own_id or peer not in self.members:
             return []
         is_new = peer not in self._heard_at_s
-        if self._is_silent(peer):
-            self._voters = None
         self._heard_at_s[peer] = max(now_s, self._heard_at_s.get(peer, now_s))
         self._ever_heard.add(peer)
         if is_new:
-            self._look_anew()
+            self._teammates = None
             self._take_term()
         return [PeerJoined(peer)] if is_new else []
 
@@ -245,8 +237,8 @@ class Group:
         before = self._states.get(peer, _SAID_NOTHING)
         has_moved = peer not in self._distrusted and self._takes_us_along(peer, state)
         self._states[peer] = state
-        if state.is_news_after(before):
-            self._look_anew()
+        if state.team != before.team:
+            self._teammates = None
         if peer not in self._distrusted:
             self._epochs.hear(state.team, state.epoch)
             self._graph.note(peer, state.signature, now_s)
@@ -258,8 +250,6 @@ class Group:
 
     def set_own_state(self, state: MapState) -> None:
         """Note which map this drone flies on; its team and epoch are known here."""
-        if state.is_news_after(self._states.get(self.own_id, _SAID_NOTHING)):
-            self._look_anew()
         self._states[self.own_id] = state
 
     def note_signature(self, signature: bytes, now_s: float) -> None:
@@ -345,13 +335,9 @@ class Group:
     @property
     def _electorate(self) -> tuple[int, ...]:
         """Those who decide on our map, and make it: teammates believed, heard, not on their own."""
-        if self._voters is None or self._now_s >= self._silent_from_s:
-            self._voters = tuple(
-                m for m in self.trusted_teammates if m not in self._apart and not self._is_silent(m)
-            )
-            heard = (self._heard_at_s.get(m, math.inf) for m in self._voters)
-            self._silent_from_s = min(heard, default=math.inf) + self._silent_s
-        return self._voters
+        return tuple(
+            m for m in self.trusted_teammates if m not in self._apart and not self._is_silent(m)
+        )
 
     def _is_silent(self, member: int) -> bool:
         """Whether a member may be lost, which is known later: nobody else waits for its word."""
@@ -370,16 +356,12 @@ class Group:
         What team we fly with, and who leads it, is seen to as well.
         """
         self._note_time(now_s)
-        late: list[int] = []
-        if now_s >= self._lost_from_s:
-            late = [p for p, at_s in self._heard_at_s.items() if now_s >= at_s + self._timeout_s]
-            for peer in late:
-                del self._heard_at_s[peer]
-                self._states.pop(peer, None)
-                self._graph.forget(peer)
-                self._look_anew()
-            # Whoever comes later is lost later.
-            self._lost_from_s = min(self._heard_at_s.values(), default=now_s) + self._timeout_s
+        late = [p for p, at_s in self._heard_at_s.items() if now_s >= at_s + self._timeout_s]
+        for peer in late:
+            del self._heard_at_s[peer]
+            self._states.pop(peer, None)
+            self._teammates = None
+            self._graph.forget(peer)
         self._graph.poll(now_s)
         roster = self._roster()
         self._go_to(self._team_by(roster))
@@ -417,12 +399,7 @@ class Group:
 
     def _go_to(self, team: int) -> None:
         if team != self._team:
-            self._team = team
-            self._look_anew()
-
-    def _look_anew(self) -> None:
-        """Note that who flies with whom, on what, may be otherwise from now on."""
-        self._teammates = self._voters = self._known_roster = None
+            self._team, self._teammates = team, None
 
     def _take_term(self) -> None:
         """Take an epoch when this drone has begun to coordinate, or hears of a newer one."""
@@ -450,21 +427,14 @@ class Group:
         return team_with_a_map(roster) if self._has_listened else self._team
 
     def _roster(self) -> Roster:
-        one = self.coordinator
-        coordinator = one if one == self.own_id or one in self._heard_at_s else None
-        # It may be another one by the time alone.
-        if self._known_roster is None or self._known_roster.coordinator != coordinator:
-            self._known_roster = self._new_roster(coordinator)
-        return self._known_roster
-
-    def _new_roster(self, coordinator: int | None) -> Roster:
         believed = {m for m in self.alive if m not in self._distrusted or m == self.leader}
         mapped = {m: s for m in believed if (s := self._states.get(m)) and s.revision}
+        coordinator = self.coordinator
         return Roster(
             self.own_id,
             self.leader,
             {m: self.team_of(m) for m in believed},
             {m: state.world for m, state in mapped.items()},
             {m for m, state in mapped.items() if state.localized and not state.wants_update},
-            coordinator,
+            coordinator if coordinator in believed else None,
         )
