@@ -15,7 +15,7 @@ from vcl_companion.links.counters import LinkCounters
 from vcl_companion.links.peers import PeerLink, PeerOptions, open_signing
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions
-from vcl_companion.swarm.group import SwarmOptions
+from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.swarm.transfer import TransferOptions, Transfers
 
@@ -54,6 +54,7 @@ class AirLink(PeerLink):
         own: its system id.
         members: of the swarm.
         exchange: takes what is for it.
+        group: how often it shows itself.
         clock: its time.
         key_file: what all sign with.
         air: carries what it sends.
@@ -65,6 +66,7 @@ class AirLink(PeerLink):
         own: int,
         members: tuple[int, ...],
         exchange: Exchange,
+        group: Group,
         clock: LoopClock,
         key_file: str,
         air: Air,
@@ -73,6 +75,7 @@ class AirLink(PeerLink):
         super().__init__(
             options, own, frozenset(members), exchange.on_tunnel, exchange.on_heartbeat,
             clock, exchange.clocks.answered, open_signing(options, clock.moment),
+            stretch=lambda: group.stretch,
         )  # fmt: skip
         air_socket = AirSocket(self._tally, lambda data: air.transmit(name, data))
         self._socket = air_socket
@@ -110,8 +113,9 @@ class ScaledDrone:
         transfers = Transfers(TransferOptions(), rng)
         building, inter = MapOptions(detectors=DETECTORS), InterMavOptions(detector=DETECTORS[0])
         self._parts = DroneParts(own, SwarmOptions(members), transfers, building, inter, clock, rng)
-        self._link = AirLink(self.name, own, members, self._parts.exchange, clock, key_file, air)
-        self._parts.exchange.attach(self._link)
+        exchange, group = self._parts.exchange, self._parts.group
+        self._link = AirLink(self.name, own, members, exchange, group, clock, key_file, air)
+        exchange.attach(self._link)
         air.join(self.name, self._link.hear, self._context)
         self._task = asyncio.get_running_loop().create_task(self._run(), context=self._context)
 

@@ -38,7 +38,8 @@ class ScaleTimes:
 
     Attributes:
         start_s: from the first drone's start on.
-        rest_s: later, when drones know each other and their clocks, and no map is about.
+        rest_s: later, when drones know each other and their clocks, and no map is about; and
+            again at the end, when all hold one.
     """
 
     start_s: float = 10.0
@@ -127,9 +128,9 @@ async def _lived(
         update = scene.next_map(first, revision, drone=2)
         n_bytes = len(encode_map_update(encode_map(update), first))
         updated = await swarm.handed_out("update", update, n_bytes)
-        return SwarmResult(
-            n_drones, (start, rest, handed, updated), known_s, swarm.air.dropped(), swarm.refused()
-        )
+        mapped = await swarm.phase("rest, mapped", times.rest_s)
+        phases = start, rest, handed, updated, mapped
+        return SwarmResult(n_drones, phases, known_s, swarm.air.dropped(), swarm.refused())
     finally:
         await swarm.end()
 

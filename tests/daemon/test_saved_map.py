@@ -40,8 +40,8 @@ def test_what_was_saved_is_flown_on_after_a_restart_until_it_is_forgotten(tmp_pa
             await members.stop(one)
 
             again = await members.start(1, directory=str(place))
-            await computed(lambda: again.revision == revision_of(MAP))
-            assert again.events("saved map") == ["begins on the saved map"]
+            await computed(lambda: again.events("saved map") == ["begins on the saved map"])
+            assert again.revision == revision_of(MAP)
             await again.see(demo.frame(1, 0))
             assert await answered(again, SAVE, 1.0) == ACCEPTED
             assert again.revision == revision_of(MAP)  # it stays until the end

@@ -19,7 +19,7 @@ from sitl.scale.swarm import Phase, ScaleTimes, run_swarm
 from vcl_companion.errors import ConfigError
 
 TIMES = ScaleTimes(start_s=5.0, settle_s=10.0, rest_s=16.0)
-PHASES = ["start", "rest", "first map", "update"]
+PHASES = ["start", "rest", "first map", "update", "rest, mapped"]
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
     told: list[str] = []
     report = scale(out, ScaleOptions((5, 2), loss=0.1, times=TIMES), told.append)
     assert told[0] == "2 drones: start"
-    assert told[-1] == "5 drones: update"
+    assert told[-1] == "5 drones: rest, mapped"
     return report, out
 
 
@@ -76,6 +76,20 @@ def test_a_group_at_rest_says_little_however_many(measured: tuple[dict[str, Any]
         assert 0.0 < rest["cpu_share"]["mean"] <= rest["cpu_share"]["most"]
 
 
+def test_of_many_nobody_hears_more_than_of_some() -> None:
+    """At full pace the signs of life of 16, and no more however many there are."""
+    times = ScaleTimes(3.0, 8.0, 12.0)
+    some, many = (run_swarm(n_drones, 0.1, 3, times, lambda _: None) for n_drones in (22, 44))
+    for at_rest in (1, -1):
+        of_some, of_many = some.phases[at_rest], many.phases[at_rest]
+        assert max(of_many.heard_bytes) < 1.5 * max(of_some.heard_bytes)
+        # Who coordinates shows itself every second.
+        assert max(of_many.sent_bytes) == of_many.sent_bytes[0] > 1.5 * min(of_many.sent_bytes)
+    # Who come are at full pace until they know each other.
+    assert many.known_s < 10.0
+    assert many.phases[1].by_message["heartbeat"].messages <= 43 * 4 + 13
+
+
 def test_who_join_at_one_time_are_told_together() -> None:
     """A state each second, and a few more for those who have joined: not one for each of them."""
     start, *_ = run_swarm(12, 0.0, 1, ScaleTimes(4.0, 0.1, 0.1), lambda _: None).phases
@@ -100,7 +114,7 @@ def but_for_the_processor(of: Phase) -> tuple[object, ...]:
 def test_a_page_and_a_plot_show_them(measured: tuple[dict[str, Any], Path]) -> None:
     _, out = measured
     text = (out / "scale.md").read_text(encoding="utf-8")
-    assert text.count("\n| 2 |") == text.count("\n| 5 |") == 4
+    assert text.count("\n| 2 |") == text.count("\n| 5 |") == 5
     assert "| rest |" in text
     # A file of its own has to be XML, which a page that holds it need not be.
     picture = ElementTree.parse(out / "scale.svg").getroot()

@@ -238,6 +238,7 @@ async def _run(config: Config) -> int:
         exchange.clocks.answered,
         signing,
         disk,
+        lambda: group.stretch,
     )
     exchange.attach(peers)
     if isinstance(camera, StreamCamera):  # no other camera asks

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -55,6 +56,9 @@ from vcl_companion.wire.messages import MapRefused
 _log = logging.getLogger(__name__)
 
 _SIGNATURE_S = 2.0
+# So much longer at least between two looks at who is silent by now, for each time that these
+# speak more rarely.
+_LOOK_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -307,10 +311,13 @@ class Exchange:
             parts.create_task(self._keep_going())
 
     async def _keep_going(self) -> None:
+        looked_at_s = -math.inf
         while True:
             now_s = self._now_s()
-            self._presence.poll(now_s)
-            self._review()
+            if now_s >= looked_at_s + _LOOK_S * (self._group.stretch - 1.0):
+                looked_at_s = now_s
+                self._presence.poll(now_s)
+                self._review()
             self._own_state.poll(now_s)
             self._sharing.handing.hand_out(now_s)
             self._deliveries.take(self._outbox.poll())

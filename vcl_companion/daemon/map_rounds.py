@@ -167,8 +167,9 @@ class MapRounds:
         while True:
             self._trigger.poll(self._now_s())
             stored, frame = self._maps.current, self._untried()
+            look_s = _LOOK_S * self._group.stretch
             if frame is None:
-                await asyncio.sleep(_LOOK_S)
+                await asyncio.sleep(look_s)
             elif stored is None and self._is_first_due(began_at_s):
                 self._tried = frame
                 await self._first_map(frame)
@@ -180,7 +181,7 @@ class MapRounds:
                     self.progress, self.is_asked = _NO_UPDATE, False
                 self._trigger.ended(self._now_s(), from_new_places=self._is_from_new_places)
             else:
-                await asyncio.sleep(_LOOK_S)
+                await asyncio.sleep(look_s)
 
     def _is_due(self) -> bool:
         if self._is_merging():

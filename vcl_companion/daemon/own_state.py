@@ -122,7 +122,7 @@ class OwnState:
         seen = self._estimator
         revision = stored.revision if stored else b""
         group = self._group
-        is_coming = group.own_id in group.lacking()
+        is_coming = group.is_map_coming
         self._vote.follow(revision, group.majority_wants_update, is_coming, now_s)
         if stored is not None and seen.seen_on != stored.revision:
             self._wants_update = self._vote.unseen()
@@ -157,5 +157,6 @@ class OwnState:
         if told is None or told.localized != localized:
             return _INTERVAL_S
         change = abs(self._estimator.tracked - told.tracked)
+        interval_s = _INTERVAL_S * self._group.stretch
         is_news = change > _NEWS_SHARE * max(told.tracked, 1)
-        return _INTERVAL_S if is_news else _AT_REST_S
+        return interval_s if is_news else max(_AT_REST_S, interval_s)

@@ -26,12 +26,12 @@ from vcl_companion.links.messages import (
 from vcl_companion.links.reconnect import Address
 from vcl_companion.links.signing import AHEAD, BEHIND, FORGED, NO_KEY, UNSIGNED, SigningOptions
 from vcl_companion.links.transport import open_peer_socket, parse_peers
+from vcl_companion.swarm.pace import FULL_PACE_S, stretch_of
 
 _log = logging.getLogger(__name__)
 
-_HEARTBEAT_S = 1.0
-# A member that was silent for longer may have moved to another address.
-_ADDRESS_STALE_S = 5.0
+# A member that was silent for longer may have moved to another address: so many signs of life.
+_ADDRESS_STALE = 5
 _STATE_ACTIVE = 4
 # Nobody who means it asks for the time more often.
 _LEAST_BETWEEN_ANSWERS_S = 0.1
@@ -107,6 +107,7 @@ class PeerLink:
         on_time: takes a member's answer about the time: system id, ts1, tc1.
         signing: of ``open_signing``.
         disk: does the writing that signing needs; None: the loop's own executor.
+        stretch: tells how many times as rarely as in a small swarm heartbeats are sent.
     """
 
     def __init__(
@@ -120,6 +121,7 @@ class PeerLink:
         on_time: Callable[[int, int, int], None],
         signing: KeptSigning,
         disk: Executor | None = None,
+        stretch: Callable[[], float] = lambda: 1.0,
     ) -> None:
         self._system_id = system_id
         self._members = members
@@ -129,6 +131,9 @@ class PeerLink:
         self._on_time = on_time
         self._kept = signing
         self._disk = disk
+        self._stretch = stretch
+        self._address_stale_s = _ADDRESS_STALE * FULL_PACE_S * stretch_of(len(members))
+        self._beat_at_s = float("-inf")
         self._tally = LinkTally()
         self._codec = Codec(
             system_id, COMPONENT_COMPANION, self._tally, signing.signing, signing.now
@@ -172,7 +177,10 @@ class PeerLink:
 
     def _send(self, frame: bytes, target_system: int) -> None:
         address, heard_at_s = self._addresses.get(target_system, (None, 0.0))
-        if address is None or asyncio.get_running_loop().time() - heard_at_s > _ADDRESS_STALE_S:
+        if (
+            address is None
+            or asyncio.get_running_loop().time() - heard_at_s > self._address_stale_s
+        ):
             self._socket.write(frame)
         else:
             self._socket.write_to(frame, address)
@@ -264,12 +272,16 @@ class PeerLink:
         return "not a peer's message"
 
     def _beat(self) -> None:
+        self._beat_at_s = asyncio.get_running_loop().time()
         self._socket.write(self._codec.heartbeat(_STATE_ACTIVE))
 
     async def _heartbeats(self) -> None:
         while True:
-            await asyncio.sleep(_HEARTBEAT_S)
-            self._beat()
+            await asyncio.sleep(FULL_PACE_S)
+            # A turn comes a little early or late: due is what the next one would be too late for.
+            since_s = asyncio.get_running_loop().time() - self._beat_at_s
+            if since_s >= FULL_PACE_S * (self._stretch() - 0.5):
+                self._beat()
             self._tell()
 
     def _tell(self) -> None:

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from vcl_companion.errors import ConfigError
 from vcl_companion.swarm.epochs import FIRST, VACANT, Epochs
 from vcl_companion.swarm.overlap import OverlapGraph, OverlapOptions
+from vcl_companion.swarm.pace import FULL_PACE_S, stretch_of
 from vcl_companion.swarm.swarm_options import SwarmOptions
 from vcl_companion.swarm.teams import Meetings, Parting, Roster, team_with_a_map
 from vcl_companion.wire.messages import MapState
@@ -31,7 +32,7 @@ __all__ = ["Group", "GroupEvent", "PeerJoined", "PeerLost", "SwarmOptions"]
 # A signature is told no more often: 48 bytes more each time.
 _SIGNATURE_INTERVAL_S = 2.9
 # Who has said nothing for this share of the time-out, and for so long, s, is not waited for any
-# more; it speaks once a second.
+# more; it speaks once a second. Both are stretched with the pace (``pace``).
 _SILENT, _SILENT_S = 0.5, 2.5
 _SAID_NOTHING = MapState(b"", 0, False)
 
@@ -71,8 +72,10 @@ class Group:
         self.measured = tuple(sorted({m for a, b, _ in options.known_distances for m in (a, b)}))
         self._timeout_s = options.heartbeat_timeout_s
         self._silent_s = max(_SILENT * self._timeout_s, _SILENT_S)
+        self._stretch = stretch_of(len(self.members))
         self._leader_wait_s = options.leader_wait_s
         self._heard_at_s: dict[int, float] = {}  # members alive
+        self._joined_at_s = -math.inf  # somebody, last
         self._ever_heard: set[int] = set()
         self._states: dict[int, MapState] = {}  # ours, and of members alive
         self._distrusted: frozenset[int] = frozenset()
@@ -81,11 +84,15 @@ class Group:
         # Asked for with every message, and changed by hardly any; None: to be found anew.
         self._teammates: tuple[int, ...] | None = None
         self._epochs = Epochs(own_id)
-        self._graph = OverlapGraph(self.members, OverlapOptions())
+        overlaps = OverlapOptions().stretched(_SIGNATURE_INTERVAL_S, self._stretch * FULL_PACE_S)
+        self._graph = OverlapGraph(self.members, overlaps)
         self._parting = Parting(self._graph, options.split_after_s)
         self._meetings = Meetings(self._graph, options.rejoin_after_s)
         self._began_at_s = math.inf
         self._now_s = -math.inf
+        # Who coordinated when that was last looked at, and since when: it shows itself at full
+        # pace from then on.
+        self._led_by, self._led_since_s = own_id, -math.inf
         self._signature = b""
         self._told_signature_at_s = -math.inf
 
@@ -136,10 +143,26 @@ class Group:
         return self.coordinator == self.own_id
 
     @property
+    def stretch(self) -> float:
+        """How many times as rarely as in a small swarm this drone sees to what is not news.
+
+        To show itself (``pace``), and to look through all the others; 1 for who coordinates, and
+        while those who have just come may not have heard everybody yet.
+        """
+        is_meeting = self._now_s < self._joined_at_s + self._timeout_s
+        return 1.0 if is_meeting or self.is_coordinator else self._stretch
+
+    @property
     def newest_revision(self) -> bytes:
         """The coordinator's map, empty while it has none as far as known."""
         state = self._states.get(self.coordinator)
         return state.revision if state else b""
+
+    @property
+    def is_map_coming(self) -> bool:
+        """Whether our team's newest revision is another than this drone flies on."""
+        own = self._states.get(self.own_id)
+        return self.newest_revision not in (b"", own.revision if own else b"")
 
     @property
     def team(self) -> int:
@@ -225,6 +248,7 @@ class Group:
         self._heard_at_s[peer] = max(now_s, self._heard_at_s.get(peer, now_s))
         self._ever_heard.add(peer)
         if is_new:
+            self._joined_at_s = now_s
             self._teammates = None
             self._take_term()
         return [PeerJoined(peer)] if is_new else []
@@ -287,10 +311,10 @@ class Group:
             state = self._states.get(member)
             return state.tracked if state is not None else 0
 
-        trusted = self._electorate
-        others = sorted(trusted, key=lambda member: (seen(member), member))
+        those = set(filter(self._counts, self.teammates))
+        others = sorted(those, key=lambda member: (seen(member), member))
         order = dict.fromkeys((self.own_id, *first, *others))
-        return tuple(m for m in order if m in trusted)[:most]
+        return tuple(m for m in order if m in those)[:most]
 
     def has_map(self, member: int) -> bool:
         """Whether a member has said so; one on a part of a map says that it has none."""
@@ -312,8 +336,8 @@ class Group:
         """
         if not self.newest_revision:
             return ()
-        holders = self.holders(self.newest_revision)
-        return tuple(member for member in self._electorate if member not in holders)
+        holders = set(self.holders(self.newest_revision))
+        return tuple(m for m in self.teammates if m not in holders and self._counts(m))
 
     @property
     def wanting_update(self) -> tuple[int, ...]:
@@ -325,24 +349,32 @@ class Group:
         if not self.newest_revision:
             return ()
         holders = self.holders(self.newest_revision)
-        return tuple(m for m in self._electorate if m in holders and self._states[m].wants_update)
+        return tuple(m for m in holders if self._states[m].wants_update and self._counts(m))
 
     @property
     def majority_wants_update(self) -> bool:
         """Whether more than half of those that have a vote (``lacking``) are for an update."""
-        return 2 * len(self.wanting_update) > len(self._electorate)
+        n_wanting = len(self.wanting_update)
+        return n_wanting > 0 and 2 * n_wanting > sum(map(self._counts, self.teammates))
 
-    @property
-    def _electorate(self) -> tuple[int, ...]:
-        """Those who decide on our map, and make it: teammates believed, heard, not on their own."""
-        return tuple(
-            m for m in self.trusted_teammates if m not in self._apart and not self._is_silent(m)
-        )
+    def _counts(self, member: int) -> bool:
+        """Whether a teammate decides on our map, and makes it: believed, heard, not on its own."""
+        is_apart = member in self._distrusted or member in self._apart
+        return not is_apart and not self._is_silent(member)
 
     def _is_silent(self, member: int) -> bool:
         """Whether a member may be lost, which is known later: nobody else waits for its word."""
-        heard_at_s = self._heard_at_s.get(member)
-        return heard_at_s is not None and self._now_s >= heard_at_s + self._silent_s
+        if member not in self._heard_at_s:
+            return False
+        return self._now_s >= self._is_late_at_s(member, self._silent_s)
+
+    def _is_late_at_s(self, member: int, after_s: float) -> float:
+        """Return when a member will have been silent for so long, at full pace."""
+        heard_at_s = self._heard_at_s[member]
+        late_at_s = heard_at_s + after_s * self._stretch
+        if member != self._led_by:
+            return late_at_s
+        return min(late_at_s, max(heard_at_s, self._led_since_s) + after_s)
 
     def most_others_hold(self, revision: bytes) -> bool:
         """Whether most of the other teammates trusted, and at least two, hold a revision."""
@@ -356,7 +388,7 @@ class Group:
         What team we fly with, and who leads it, is seen to as well.
         """
         self._note_time(now_s)
-        late = [p for p, at_s in self._heard_at_s.items() if now_s >= at_s + self._timeout_s]
+        late = [p for p in self._heard_at_s if now_s >= self._is_late_at_s(p, self._timeout_s)]
         for peer in late:
             del self._heard_at_s[peer]
             self._states.pop(peer, None)
@@ -367,13 +399,15 @@ class Group:
         self._go_to(self._team_by(roster))
         self._meetings.poll(roster, now_s)
         self._take_term()
+        if self.coordinator != self._led_by:
+            self._led_by, self._led_since_s = self.coordinator, now_s
         return [PeerLost(peer) for peer in sorted(late)]
 
     def next_poll_s(self) -> float | None:
         """Return when somebody is lost if nothing is heard until then; None for nobody."""
         if not self._heard_at_s:
             return None
-        return min(self._heard_at_s.values()) + self._timeout_s
+        return min(self._is_late_at_s(peer, self._timeout_s) for peer in self._heard_at_s)
 
     @property
     def _awaits_leader(self) -> bool:

@@ -6,13 +6,13 @@ whose sum reaches the threshold overlaps, until it has not been confirmed for a 
 
 A drone adds up all pairs of members, not its own alone: who parts from the coordinator is
 to be seen by all who part with it. A signature is compared with those of all others at once:
-of 100 members that tell one in three seconds each that is 4 ms of every second, and 200 kB.
+of 100 members that tell one in six seconds each that is 2 ms of every second, and 200 kB.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -46,6 +46,11 @@ class OverlapOptions:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         if not self.most >= self.threshold:
             raise ValueError(f"most, {self.most}, is below the threshold, {self.threshold}")
+
+    def stretched(self, told_every_s: float, shown_every_s: float) -> OverlapOptions:
+        """Return them for members who show themselves more rarely than signatures are told."""
+        by = max(1.0, shown_every_s / told_every_s)
+        return replace(self, apart_s=by * self.apart_s, fresh_s=by * self.fresh_s)
 
 
 class OverlapGraph:

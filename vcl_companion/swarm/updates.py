@@ -448,15 +448,16 @@ class UpdateTrigger:
 
     def _shows_more(self) -> bool:
         """Whether most members see clearly more of the newest revision than of the last."""
+        teammates = set(self._group.teammates)
         more = [
             member
             for member, (revision, tracked) in self._told.items()
             if revision == self._revision
             and member in self._before
-            and member in self._group.teammates
+            and member in teammates
             and tracked > max(_SEES_MORE * self._before[member], self._options.tracked)
         ]
-        return 2 * len(more) > len(self._group.teammates)
+        return 2 * len(more) > len(teammates)
 
     def _is_lost(self, member: int) -> bool:
         state = self._group.state_of(member)
