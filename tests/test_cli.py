@@ -1,4 +1,6 @@
 import logging
+import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -47,6 +49,27 @@ def test_a_missing_configuration_names_the_file(tmp_path: Path) -> None:
     result = CliRunner().invoke(main, ["run", "--config", str(tmp_path / "none.toml")])
     assert result.exit_code == 2
     assert "none.toml: No such file" in result.output
+
+
+def test_ctrl_c_is_one_line_and_status_130() -> None:
+    # Who runs the tests in the background may have them ignore it.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with socket.create_server(("127.0.0.1", 0)) as drone:
+            drone.settimeout(60.0)
+            order = ["ground", "resume", "--link", f"tcp:127.0.0.1:{drone.getsockname()[1]}"]
+            with subprocess.Popen(
+                [sys.executable, "-m", "vcl_companion.cli", *order],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            ) as run:
+                drone.accept()[0].close()
+                run.send_signal(signal.SIGINT)
+                out, error = run.communicate(timeout=60.0)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert (run.returncode, out, error) == (130, "", "vcl: interrupted\n")
 
 
 def test_help_loads_nothing_heavy() -> None:

@@ -38,6 +38,9 @@ class _Commands(click.Group):
         except VclError as error:
             _tell(error)
             ctx.exit(2)
+        except KeyboardInterrupt:
+            click.echo("vcl: interrupted", err=True)
+            ctx.exit(130)
 
 
 def _tell(error: VclError) -> None:

@@ -94,3 +94,11 @@ def test_whatever_is_told_the_parts_hold_everybody_once(told: list[tuple[int, by
     parts = graph.components((4, 2, 1))
     assert sorted(m for part in parts for m in part) == [1, 2, 4]
     assert all(graph.component(m, (1, 2, 4)) == part for part in parts for m in part)
+
+
+def test_signatures_that_are_told_more_rarely_count_for_longer() -> None:
+    options = OverlapOptions()
+    assert options.stretched(0.5) == options
+    longer = options.stretched(1.5)
+    assert (longer.fresh_s, longer.apart_s) == (1.5 * options.fresh_s, 1.5 * options.apart_s)
+    assert (longer.threshold, longer.most) == (options.threshold, options.most)

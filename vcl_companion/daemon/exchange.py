@@ -58,7 +58,7 @@ _log = logging.getLogger(__name__)
 _SIGNATURE_S = 2.0
 # So much longer at least between two looks at who is silent by now, for each time that these
 # speak more rarely.
-_LOOK_S = 0.1
+_LOOK_S, _LONGEST_LOOK_S = 0.1, 0.5
 
 
 @dataclass(frozen=True)
@@ -314,10 +314,10 @@ class Exchange:
         looked_at_s = -math.inf
         while True:
             now_s = self._now_s()
-            if now_s >= looked_at_s + _LOOK_S * (self._group.stretch - 1.0):
+            if now_s >= looked_at_s + min(_LOOK_S * (self._group.stretch - 1.0), _LONGEST_LOOK_S):
                 looked_at_s = now_s
                 self._presence.poll(now_s)
-                self._review()
+            self._review()
             self._own_state.poll(now_s)
             self._sharing.handing.hand_out(now_s)
             self._deliveries.take(self._outbox.poll())

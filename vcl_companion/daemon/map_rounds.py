@@ -39,12 +39,13 @@ _log = logging.getLogger(__name__)
 
 # Percent of an update.
 _GATHERING, _BUILDING, _NO_UPDATE = 20, 60, 255
-_LOOK_S = 0.1
+_LOOK_S, _LONGEST_LOOK_S = 0.1, 0.5
 # A camera that delivers nothing new has nothing for a map either.
 _STALE_NS = 60 * 1_000_000_000
 
 # Who has less than this share of our landmarks in sight looks elsewhere by now, or soon: its word
-# is a second old, and one that turns away fast needs its view in this update, not in the next.
+# is a second old (more in a large swarm), and one that turns away fast needs its view in this
+# update, not in the next.
 _LEAST_SEEN = 0.65
 # Whoever has been heard by us is heard by all a moment later, and is sent what all are sent.
 _ACQUAINTED_S = 0.5
@@ -167,7 +168,7 @@ class MapRounds:
         while True:
             self._trigger.poll(self._now_s())
             stored, frame = self._maps.current, self._untried()
-            look_s = _LOOK_S * self._group.stretch
+            look_s = min(_LOOK_S * self._group.stretch, _LONGEST_LOOK_S)
             if frame is None:
                 await asyncio.sleep(look_s)
             elif stored is None and self._is_first_due(began_at_s):

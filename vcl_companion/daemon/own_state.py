@@ -18,6 +18,8 @@ from vcl_companion.wire.messages import MAX_TRACKED, MapState
 _INTERVAL_S = 1.0
 # Nothing new to tell: that we are there the heartbeats say.
 _AT_REST_S = 2.0
+# What is news is said again for so long at full pace: of many somebody missed it.
+_NEWS_S = 4.5
 # So much more or less of the map in sight is news.
 _NEWS_SHARE = 0.1
 # Who joins is told soon, and all who join meanwhile with it: a group starts at one time.
@@ -66,6 +68,7 @@ class OwnState:
         self._has_joined = False  # somebody, who has not been told our state since
         self._told_at_s = float("-inf")
         self._told_lead = (0, 0)
+        self._news_until_s = float("-inf")
 
     @property
     def update_options(self) -> UpdateOptions:
@@ -82,7 +85,7 @@ class OwnState:
 
     def poll(self, now_s: float) -> None:
         """Look at what we see, and tell our state if it is time."""
-        interval_s = _TO_NEW_S if self._has_joined else self._interval_s()
+        interval_s = _TO_NEW_S if self._has_joined else self._interval_s(now_s)
         lead = self._group.team, self._group.own_epoch
         if lead[0] != self._told_lead[0]:
             self._log.event("team", f"of drone {lead[0]}" if lead[0] else "of all")
@@ -100,7 +103,7 @@ class OwnState:
 
     def tell(self) -> None:
         """Tell our state at once."""
-        stored = self._maps.current
+        stored, now_s = self._maps.current, asyncio.get_running_loop().time()
         state = MapState(
             stored.told_revision if stored else b"",
             stored.n_landmarks if stored else 0,
@@ -110,8 +113,11 @@ class OwnState:
             self._group.team,
             self._group.epoch,
             world=stored.world if stored and stored.told_revision else b"",
-            signature=self._group.signature_to_tell(asyncio.get_running_loop().time()),
+            signature=self._group.signature_to_tell(now_s),
         )
+        before = self._group.state_of(self._group.own_id)
+        if before is None or state.is_news_after(before):
+            self._news_until_s = now_s + _NEWS_S
         self._group.set_own_state(state)
         self._send(state, 0)
 
@@ -150,13 +156,13 @@ class OwnState:
         camera, mounting = self._sensor.camera, self._sensor.body_from_cam
         return novelty_from(stored.index.landmark_map, there @ mounting, camera)
 
-    def _interval_s(self) -> float:
+    def _interval_s(self, now_s: float) -> float:
         """How long after the last state the next one is told."""
         told = self._group.state_of(self._group.own_id)
         localized = self._estimator.is_localized(self._clock.now_ns())
         if told is None or told.localized != localized:
             return _INTERVAL_S
         change = abs(self._estimator.tracked - told.tracked)
-        interval_s = _INTERVAL_S * self._group.stretch
+        interval_s = _INTERVAL_S * (1.0 if now_s < self._news_until_s else self._group.stretch)
         is_news = change > _NEWS_SHARE * max(told.tracked, 1)
         return interval_s if is_news else max(_AT_REST_S, interval_s)

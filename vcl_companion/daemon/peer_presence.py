@@ -61,7 +61,7 @@ class PeerPresence:
         before = self._group.state_of(peer)
         if before is not None and before.revision and not state.revision:
             self._forgot(peer)
-            self._own_state.joined()  # nobody may have missed it: it is not silent for that long
+            self._clocks.joined(peer)
         self._note(self._group.map_state(peer, state, self._now_s()))
         return before is None or state.is_news_after(before)
 

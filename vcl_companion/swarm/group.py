@@ -20,7 +20,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from vcl_companion.errors import ConfigError
-from vcl_companion.swarm.epochs import FIRST, VACANT, Epochs
+from vcl_companion.swarm.epochs import FIRST, VACANT, Epochs, taken_by
 from vcl_companion.swarm.overlap import OverlapGraph, OverlapOptions
 from vcl_companion.swarm.pace import FULL_PACE_S, stretch_of
 from vcl_companion.swarm.swarm_options import SwarmOptions
@@ -31,8 +31,10 @@ __all__ = ["Group", "GroupEvent", "PeerJoined", "PeerLost", "SwarmOptions"]
 
 # A signature is told no more often: 48 bytes more each time.
 _SIGNATURE_INTERVAL_S = 2.9
+# So often at rest where all are at full pace.
+_SIGNATURE_EVERY_S = 4.0
 # Who has said nothing for this share of the time-out, and for so long, s, is not waited for any
-# more; it speaks once a second. Both are stretched with the pace (``pace``).
+# more; it speaks once a second, in a large swarm more rarely (``pace``).
 _SILENT, _SILENT_S = 0.5, 2.5
 _SAID_NOTHING = MapState(b"", 0, False)
 
@@ -75,7 +77,7 @@ class Group:
         self._stretch = stretch_of(len(self.members))
         self._leader_wait_s = options.leader_wait_s
         self._heard_at_s: dict[int, float] = {}  # members alive
-        self._joined_at_s = -math.inf  # somebody, last
+        self._hasty_until_s = -math.inf  # at full pace until then
         self._ever_heard: set[int] = set()
         self._states: dict[int, MapState] = {}  # ours, and of members alive
         self._distrusted: frozenset[int] = frozenset()
@@ -84,7 +86,9 @@ class Group:
         # Asked for with every message, and changed by hardly any; None: to be found anew.
         self._teammates: tuple[int, ...] | None = None
         self._epochs = Epochs(own_id)
-        overlaps = OverlapOptions().stretched(_SIGNATURE_INTERVAL_S, self._stretch * FULL_PACE_S)
+        # One rides on a state.
+        told_s = math.ceil(_SIGNATURE_INTERVAL_S / self._stretch) * self._stretch
+        overlaps = OverlapOptions().stretched(told_s / _SIGNATURE_EVERY_S)
         self._graph = OverlapGraph(self.members, overlaps)
         self._parting = Parting(self._graph, options.split_after_s)
         self._meetings = Meetings(self._graph, options.rejoin_after_s)
@@ -146,11 +150,11 @@ class Group:
     def stretch(self) -> float:
         """How many times as rarely as in a small swarm this drone sees to what is not news.
 
-        To show itself (``pace``), and to look through all the others; 1 for who coordinates, and
-        while those who have just come may not have heard everybody yet.
+        To show itself (``pace``), and to look through all the others; 1 for who coordinates, or
+        did until now and may be waited for as that yet, and while those who have just come may
+        not have heard everybody.
         """
-        is_meeting = self._now_s < self._joined_at_s + self._timeout_s
-        return 1.0 if is_meeting or self.is_coordinator else self._stretch
+        return 1.0 if self._now_s < self._hasty_until_s or self.is_coordinator else self._stretch
 
     @property
     def newest_revision(self) -> bytes:
@@ -248,7 +252,7 @@ class Group:
         self._heard_at_s[peer] = max(now_s, self._heard_at_s.get(peer, now_s))
         self._ever_heard.add(peer)
         if is_new:
-            self._joined_at_s = now_s
+            self._hasty_until_s = now_s + self._timeout_s
             self._teammates = None
             self._take_term()
         return [PeerJoined(peer)] if is_new else []
@@ -360,21 +364,35 @@ class Group:
     def _counts(self, member: int) -> bool:
         """Whether a teammate decides on our map, and makes it: believed, heard, not on its own."""
         is_apart = member in self._distrusted or member in self._apart
-        return not is_apart and not self._is_silent(member)
+        return not is_apart and not self.is_silent(member)
 
-    def _is_silent(self, member: int) -> bool:
+    def is_silent(self, member: int) -> bool:
         """Whether a member may be lost, which is known later: nobody else waits for its word."""
-        if member not in self._heard_at_s:
-            return False
-        return self._now_s >= self._is_late_at_s(member, self._silent_s)
+        heard_at_s = self._heard_at_s.get(member)
+        silent_s = self._silent_s + self._longer_s
+        return heard_at_s is not None and self._now_s >= heard_at_s + silent_s
 
-    def _is_late_at_s(self, member: int, after_s: float) -> float:
-        """Return when a member will have been silent for so long, at full pace."""
+    @property
+    def _longer_s(self) -> float:
+        """By how much longer than in a small swarm the next sign of life of others may take."""
+        return (self._stretch - 1.0) * FULL_PACE_S
+
+    def _lost_at_s(self, member: int) -> float:
+        """Return when a member is lost if nothing is heard of it until then."""
         heard_at_s = self._heard_at_s[member]
-        late_at_s = heard_at_s + after_s * self._stretch
+        lost_at_s = heard_at_s + self._timeout_s * self._stretch
         if member != self._led_by:
-            return late_at_s
-        return min(late_at_s, max(heard_at_s, self._led_since_s) + after_s)
+            return lost_at_s
+        # It shows itself at full pace if it knows that it coordinates.
+        if heard_at_s < self._led_since_s:
+            return min(lost_at_s, self._led_since_s + self._timeout_s + self._longer_s)
+        return heard_at_s + self._timeout_s if self._claims_to_lead(member) else lost_at_s
+
+    def _claims_to_lead(self, member: int) -> bool:
+        state = self._states.get(member)
+        if member == self.leader:
+            return True
+        return state is not None and state.team == self._team and taken_by(state.epoch) == member
 
     def most_others_hold(self, revision: bytes) -> bool:
         """Whether most of the other teammates trusted, and at least two, hold a revision."""
@@ -388,7 +406,7 @@ class Group:
         What team we fly with, and who leads it, is seen to as well.
         """
         self._note_time(now_s)
-        late = [p for p in self._heard_at_s if now_s >= self._is_late_at_s(p, self._timeout_s)]
+        late = [p for p in self._heard_at_s if now_s >= self._lost_at_s(p)]
         for peer in late:
             del self._heard_at_s[peer]
             self._states.pop(peer, None)
@@ -401,13 +419,15 @@ class Group:
         self._take_term()
         if self.coordinator != self._led_by:
             self._led_by, self._led_since_s = self.coordinator, now_s
+        if self.is_coordinator:
+            self._hasty_until_s = max(self._hasty_until_s, now_s + self._timeout_s)
         return [PeerLost(peer) for peer in sorted(late)]
 
     def next_poll_s(self) -> float | None:
         """Return when somebody is lost if nothing is heard until then; None for nobody."""
         if not self._heard_at_s:
             return None
-        return min(self._is_late_at_s(peer, self._timeout_s) for peer in self._heard_at_s)
+        return min(map(self._lost_at_s, self._heard_at_s))
 
     @property
     def _awaits_leader(self) -> bool:

@@ -47,9 +47,9 @@ class OverlapOptions:
         if not self.most >= self.threshold:
             raise ValueError(f"most, {self.most}, is below the threshold, {self.threshold}")
 
-    def stretched(self, told_every_s: float, shown_every_s: float) -> OverlapOptions:
-        """Return them for members who show themselves more rarely than signatures are told."""
-        by = max(1.0, shown_every_s / told_every_s)
+    def stretched(self, by: float) -> OverlapOptions:
+        """Return them for members who tell their signatures so many times as rarely, if they do."""
+        by = max(1.0, by)
         return replace(self, apart_s=by * self.apart_s, fresh_s=by * self.fresh_s)
 
 

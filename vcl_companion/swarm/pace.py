@@ -2,8 +2,9 @@
 
 Everybody hears everybody: signs of life at one pace would have bytes on the air, and the work of
 hearing them, grow with the swarm. As the reports of RTCP (RFC 3550, section 6.2) they come the more
-rarely the more members there are, and in all no oftener than a few a second. Who coordinates shows
-itself at full pace in any swarm, for it is to be replaced soon when it is lost.
+rarely the more members there are, and in all no oftener than those of 16 at full pace. What is news
+is told at once, and again for some seconds. Who coordinates shows itself at full pace in any swarm,
+for it is to be replaced soon when it is lost; all do while somebody joins.
 """
 
 from __future__ import annotations

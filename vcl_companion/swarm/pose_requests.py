@@ -100,7 +100,8 @@ class HostChoice:
         then those who could not tell, the one that was not asked for longest first.
         """
         able = self._able(revision)
-        able.sort(key=lambda p: (self._sigma_m(p), self._asked_in.get(p, 0), p))
+        silent = self._group.is_silent
+        able.sort(key=lambda p: (silent(p), self._sigma_m(p), self._asked_in.get(p, 0), p))
         chosen = able[:at_most]
         self._n_requests += 1
         for peer in chosen:
