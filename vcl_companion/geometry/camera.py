@@ -210,7 +210,10 @@ class Camera:
             t2 = theta * theta
             value = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
             slope = 1.0 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-            theta = theta - (value - theta_d) / slope
+            step = (value - theta_d) / slope
+            theta = theta - step
+            if not np.any(np.abs(step) >= 1e-12):
+                break
         t2 = theta * theta
         value = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
         ok = (np.abs(value - theta_d) < 1e-9) & (theta >= 0.0) & (theta < np.pi / 2 - 1e-3)

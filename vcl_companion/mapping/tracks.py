@@ -78,4 +78,8 @@ def ideal_of_pixels(observed_px: Array, cameras: list[Camera]) -> Array:
 
 def slopes_of_ideal(ideal: Array, cameras: list[Camera]) -> Array:
     """Return (N, V, 2, 2) d(pixel) / d(ideal) at (N, V, 2) ideal coordinates; NaN where unseen."""
-    return np.stack([camera.pixel_slopes(ideal[:, i]) for i, camera in enumerate(cameras)], axis=1)
+    out = np.full((*ideal.shape, 2), np.nan)
+    for i, camera in enumerate(cameras):
+        seen = np.isfinite(ideal[:, i, 0])
+        out[seen, i] = camera.pixel_slopes(ideal[seen, i])
+    return out
