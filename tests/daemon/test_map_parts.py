@@ -47,7 +47,8 @@ async def on_the_map(members: Swarm, *system_ids: int) -> list[Drone]:
 
 def test_what_is_quick_is_so_by_the_pace() -> None:
     assert 31_000 < SLOW.pace.quick_bytes < 39_000
-    assert TransferOptions().pace.quick_bytes > 150_000
+    # More takes a second to be made ready, however fast it comes.
+    assert 70_000 < TransferOptions().pace.quick_bytes < 90_000
     assert 25_000 < TransferOptions(profile="radio-57k").pace.quick_bytes < 35_000
 
 

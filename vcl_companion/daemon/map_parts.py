@@ -63,6 +63,7 @@ class MapParts:
         self._of: tuple[bytes, bytes] = (b"", b"")  # a revision, and its part; empty: it has none
         self._rests: dict[tuple[bytes, bytes], bytes] = {}  # by revision and part
         self._wanted: asyncio.Queue[bytes] = asyncio.Queue(1)  # the part of a rest; empty: a part
+        self._making: bytes | None = None
 
     def _is_long(self, stored: HandOut) -> bool:
         """Whether a map has parts; a first one is a frame of each drone: less of it is none."""
@@ -75,6 +76,7 @@ class MapParts:
             if not sent.has_arrived:
                 # Goes on, or begins again when it was given up.
                 self._sent[peer] = replace(sent, transfer_id=self._submit(peer, sent.blob))
+                self._rest(stored, sent)  # is needed as soon as it has arrived
             return not sent.has_arrived
         if not self._is_long(stored):
             return False
@@ -94,16 +96,24 @@ class MapParts:
     ) -> bytes | None:
         """Return what a map has beyond the part that a peer has; empty if it has none of ours.
 
-        None while it is being made, or the peer is about to fly on the part.
+        None while it is being made, or the part on its way. Who has the part but does not fly on
+        it yet takes what comes behind it afterwards.
         """
         sent = self._sent.get(peer)
         if sent is None:
             return b""
         if not is_on_part:
-            since_s = now_s if sent.arrived_at_s is None else sent.arrived_at_s
-            return None if now_s < since_s + TAKE_IN_S else b""
+            if sent.arrived_at_s is None:
+                return None
+            if now_s >= sent.arrived_at_s + TAKE_IN_S:
+                return b""
+        return self._rest(stored, sent)
+
+    def _rest(self, stored: HandOut, sent: _Sent) -> bytes | None:
+        """Return what a map has beyond a part; None while it, or the map in use, is being made."""
         rest = self._rests.get((stored.revision, sent.blob))
-        if rest is None:
+        current = self._maps.current
+        if rest is None and current is not None and current.revision == stored.revision:
             self._want(sent.blob)
         return rest
 
@@ -124,6 +134,7 @@ class MapParts:
             stored = self._maps.current
             if stored is None or stored.part_of:
                 continue
+            self._making = part
             try:
                 await self._make(stored, part)
             except Exception:
@@ -131,6 +142,8 @@ class MapParts:
                 _log.exception("no part of the map can be made")
                 self._of = stored.revision, b""
                 self._rests[stored.revision, part] = b""
+            finally:
+                self._making = None
 
     async def _make(self, stored: StoredMap, part: bytes) -> None:
         if not part:
@@ -141,5 +154,5 @@ class MapParts:
             del self._rests[next(iter(self._rests))]
 
     def _want(self, part: bytes) -> None:
-        if not self._wanted.full():
+        if part != self._making and not self._wanted.full():
             self._wanted.put_nowait(part)

@@ -28,10 +28,12 @@ from vcl_companion.wire.frame_codec import FrameAnswer
 
 _log = logging.getLogger(__name__)
 
-_MAPS, _IMAGES, _FRAMES, _PEERS = "maps", "images", "frames", "peers"
+_FIRST, _MAPS, _IMAGES, _FRAMES, _PEERS = "first", "maps", "images", "frames", "peers"
 # Niceness of each above the frames that are followed. Who is lost leaves the map that will show
 # where as much time as it takes; with half of these peers would get half of the machine's.
-_LANES = {_MAPS: 8, _IMAGES: 4, _FRAMES: 8, _PEERS: 12}
+# Without the whole of a map nothing goes before it; for others who have none ours goes as our
+# images do.
+_LANES = {_FIRST: 2, _MAPS: 8, _IMAGES: 4, _FRAMES: 8, _PEERS: 12}
 
 
 class MapWork:
@@ -104,12 +106,12 @@ class MapWork:
 
     async def part(self, stored: StoredMap, most_bytes: int) -> bytes:
         """See ``Workshop``."""
-        part: bytes = await self._do_with(stored, _PEERS, "part", stored.revision, most_bytes)
+        part: bytes = await self._do_with(stored, _IMAGES, "part", stored.revision, most_bytes)
         return part
 
     async def rest(self, stored: StoredMap, part: bytes) -> bytes:
         """See ``Workshop``."""
-        rest: bytes = await self._do_with(stored, _PEERS, "rest", stored.revision, part)
+        rest: bytes = await self._do_with(stored, _IMAGES, "rest", stored.revision, part)
         return rest
 
     async def ready(
@@ -117,7 +119,8 @@ class MapWork:
     ) -> ReadyMap:
         """See ``Workshop``."""
         name = b"" if current is None else current.revision
-        ready: ReadyMap = await self._do_with(current, _MAPS, "ready", offer, name, held)
+        lane = _FIRST if current is None or current.part_of else _MAPS
+        ready: ReadyMap = await self._do_with(current, lane, "ready", offer, name, held)
         return ready
 
     async def keep_only(self, stored: StoredMap) -> None:

@@ -202,13 +202,14 @@ class Workshop:
             revision: the map's.
             most_bytes: how long a part may be.
         """
-        whole = self._named(revision).index.landmark_map
+        index = self._named(revision).index
+        whole = index.landmark_map
         for n_keyframes in range(len(whole.keyframes) - 1, _LEAST_KEYFRAMES - 1, -1):
             images = whole.keyframes[-n_keyframes:]
             if sum(len(keyframe.image_bytes) for keyframe in images) > most_bytes:
                 continue
             try:
-                part = newest_part(whole, n_keyframes)
+                part = newest_part(whole, index.uncertainty, n_keyframes)
             except ValueError:
                 continue  # these do not hang together
             blob = encode_map_part(revision, encode_map(part))

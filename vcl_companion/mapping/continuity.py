@@ -85,7 +85,7 @@ def pruned(landmark_map: LandmarkMap, n_old: int, options: MapOptions) -> Landma
         del left[k]
         n_old -= 1
     if left[0] != 0 or (whole.distances and not landmark_map.distances):
-        landmark_map = _anchored_anew(landmark_map, whole, left)
+        landmark_map = _anchored_anew(landmark_map, whole, map_uncertainty(whole), left)
     excess = len(landmark_map.points_world) - options.max_landmarks
     if excess > 0:
         # The longest tracks stay; of equal ones the older.
@@ -96,8 +96,13 @@ def pruned(landmark_map: LandmarkMap, n_old: int, options: MapOptions) -> Landma
     return landmark_map
 
 
-def newest_part(whole: LandmarkMap, n_keyframes: int) -> LandmarkMap:
+def newest_part(whole: LandmarkMap, sure: MapUncertainty, n_keyframes: int) -> LandmarkMap:
     """Return what the newest keyframes of a map show: a map in the same frame, of the same scale.
+
+    Args:
+        whole: the map.
+        sure: how well it is known.
+        n_keyframes: how many of its keyframes the part is to have.
 
     Raises:
         ValueError: the map's observations do not fix it, or the part's own do not.
@@ -107,7 +112,7 @@ def newest_part(whole: LandmarkMap, n_keyframes: int) -> LandmarkMap:
     for _ in range(n_gone):
         part = _without(part, 0)
     if n_gone > 0:
-        part = _anchored_anew(part, whole, list(range(n_gone, len(whole.keyframes))))
+        part = _anchored_anew(part, whole, sure, list(range(n_gone, len(whole.keyframes))))
         map_uncertainty(part)
     return part
 
@@ -152,9 +157,11 @@ def _less(linked: Mask, k: int) -> Mask:
     return np.asarray(np.delete(np.delete(linked, k, axis=0), k, axis=1))
 
 
-def _anchored_anew(landmark_map: LandmarkMap, whole: LandmarkMap, left: list[int]) -> LandmarkMap:
+def _anchored_anew(
+    landmark_map: LandmarkMap, whole: LandmarkMap, sure: MapUncertainty, left: list[int]
+) -> LandmarkMap:
     """Return a map with frame and scale as they were in the whole that this is left of."""
-    covariance = map_uncertainty(whole).keyframe_covariance
+    covariance = sure.keyframe_covariance
     anchor = covariance[6 * left[0] :, 6 * left[0] :][:6, :6]
     distances = landmark_map.distances
     if whole.distances and not distances:

@@ -55,7 +55,7 @@ class Pace:
 # A radio of 57,600 baud takes 5,760 bytes/s from us, and the air is everybody's; so 70 %.
 PROFILES: Mapping[Profile, Pace] = MappingProxyType(
     {
-        "wifi": Pace(400_000.0, 8192, 0.2, 30.0, 1_000_000, 0.7),
+        "wifi": Pace(400_000.0, 8192, 0.2, 30.0, 1_000_000, 0.25),
         "radio-57k": Pace(4_000.0, 2 * MAX_FRAME_BYTES, 1.0, 60.0, 9_000, 10.0),
         "radio-115k": Pace(8_000.0, 2 * MAX_FRAME_BYTES, 0.6, 45.0, 16_000, 8.0),
     }
