@@ -64,9 +64,9 @@ def test_ctrl_c_is_one_line_and_status_130() -> None:
                 stderr=subprocess.PIPE,
                 text=True,
             ) as run:
-                drone.accept()[0].close()
-                run.send_signal(signal.SIGINT)
-                out, error = run.communicate(timeout=60.0)
+                with drone.accept()[0]:  # stays: a connection that ends is told of
+                    run.send_signal(signal.SIGINT)
+                    out, error = run.communicate(timeout=60.0)
     finally:
         signal.signal(signal.SIGINT, before)
     assert (run.returncode, out, error) == (130, "", "vcl: interrupted\n")

@@ -305,7 +305,7 @@ def test_every_camera_model_gives_a_covariance(camera: Camera) -> None:
 
 
 def test_on_its_way_it_takes_little_more_memory_than_in_the_end() -> None:
-    landmark_map = map_of(facade_scene(np.random.default_rng(0), 12000, n_views=4))
+    landmark_map = map_of(facade_scene(np.random.default_rng(0), 6000, n_views=4))
     tracemalloc.start()
     try:
         uncertainty = map_uncertainty(landmark_map)

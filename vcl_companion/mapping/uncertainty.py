@@ -35,7 +35,7 @@ _WIDER = 3.5
 _FINEST_M = 1e-6
 # So many landmarks are dealt with at a time: on its way what is known of one takes ten times the
 # memory that it takes in the end.
-_AT_A_TIME = 384
+_AT_A_TIME = 192
 
 
 @dataclass(frozen=True, eq=False)
