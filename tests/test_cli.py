@@ -58,15 +58,17 @@ def test_ctrl_c_is_one_line_and_status_130() -> None:
         with socket.create_server(("127.0.0.1", 0)) as drone:
             drone.settimeout(60.0)
             order = ["ground", "resume", "--link", f"tcp:127.0.0.1:{drone.getsockname()[1]}"]
-            with subprocess.Popen(
-                [sys.executable, "-m", "vcl_companion.cli", *order],
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-            ) as run:
-                with drone.accept()[0]:  # stays: a connection that ends is told of
-                    run.send_signal(signal.SIGINT)
-                    out, error = run.communicate(timeout=60.0)
+            with (
+                subprocess.Popen(
+                    [sys.executable, "-m", "vcl_companion.cli", *order],
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.PIPE,
+                    text=True,
+                ) as run,
+                drone.accept()[0],
+            ):  # the connection stays: one that ends is told of
+                run.send_signal(signal.SIGINT)
+                out, error = run.communicate(timeout=60.0)
     finally:
         signal.signal(signal.SIGINT, before)
     assert (run.returncode, out, error) == (130, "", "vcl: interrupted\n")
