@@ -10,12 +10,11 @@ from sitl.drone_parts import DETECTORS, DroneParts
 from sitl.scale.air import Air, AirSocket
 from sitl.scale.meter import Meter, metered
 from vcl_companion.clock import Moment
-from vcl_companion.daemon.exchange import Exchange
 from vcl_companion.links.counters import LinkCounters
 from vcl_companion.links.peers import PeerLink, PeerOptions, open_signing
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions
-from vcl_companion.swarm.group import Group, SwarmOptions
+from vcl_companion.swarm.group import SwarmOptions
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.swarm.transfer import TransferOptions, Transfers
 
@@ -53,8 +52,7 @@ class AirLink(PeerLink):
         name: of this drone, on the air.
         own: its system id.
         members: of the swarm.
-        exchange: takes what is for it.
-        group: how often it shows itself.
+        parts: of the drone: take what is for it, and say how often it shows itself.
         clock: its time.
         key_file: what all sign with.
         air: carries what it sends.
@@ -65,17 +63,16 @@ class AirLink(PeerLink):
         name: str,
         own: int,
         members: tuple[int, ...],
-        exchange: Exchange,
-        group: Group,
+        parts: DroneParts,
         clock: LoopClock,
         key_file: str,
         air: Air,
     ) -> None:
-        options = PeerOptions(key_file=key_file, timestamp_file="")
+        options, exchange = PeerOptions(key_file=key_file, timestamp_file=""), parts.exchange
         super().__init__(
             options, own, frozenset(members), exchange.on_tunnel, exchange.on_heartbeat,
             clock, exchange.clocks.answered, open_signing(options, clock.moment),
-            stretch=lambda: group.stretch,
+            stretch=lambda: parts.group.stretch,
         )  # fmt: skip
         air_socket = AirSocket(self._tally, lambda data: air.transmit(name, data))
         self._socket = air_socket
@@ -113,9 +110,8 @@ class ScaledDrone:
         transfers = Transfers(TransferOptions(), rng)
         building, inter = MapOptions(detectors=DETECTORS), InterMavOptions(detector=DETECTORS[0])
         self._parts = DroneParts(own, SwarmOptions(members), transfers, building, inter, clock, rng)
-        exchange, group = self._parts.exchange, self._parts.group
-        self._link = AirLink(self.name, own, members, exchange, group, clock, key_file, air)
-        exchange.attach(self._link)
+        self._link = AirLink(self.name, own, members, self._parts, clock, key_file, air)
+        self._parts.exchange.attach(self._link)
         air.join(self.name, self._link.hear, self._context)
         self._task = asyncio.get_running_loop().create_task(self._run(), context=self._context)
 

@@ -46,6 +46,7 @@ from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.group import Group, SwarmOptions
+from vcl_companion.swarm.pace import look_s
 from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
 from vcl_companion.swarm.quarantine import QuarantineOptions
 from vcl_companion.swarm.transfer import BlobKind, Transfers
@@ -56,9 +57,6 @@ from vcl_companion.wire.messages import MapRefused
 _log = logging.getLogger(__name__)
 
 _SIGNATURE_S = 2.0
-# So much longer at least between two looks at who is silent by now, for each time that these
-# speak more rarely.
-_LOOK_S, _LONGEST_LOOK_S = 0.1, 0.5
 
 
 @dataclass(frozen=True)
@@ -314,7 +312,8 @@ class Exchange:
         looked_at_s = -math.inf
         while True:
             now_s = self._now_s()
-            if now_s >= looked_at_s + min(_LOOK_S * (self._group.stretch - 1.0), _LONGEST_LOOK_S):
+            # In a small swarm at every turn: these are a look apart, or there is news.
+            if now_s >= looked_at_s + look_s(self._group.stretch - 1.0):
                 looked_at_s = now_s
                 self._presence.poll(now_s)
             self._review()

@@ -63,7 +63,7 @@ class MapParts:
         self._of: tuple[bytes, bytes] = (b"", b"")  # a revision, and its part; empty: it has none
         self._rests: dict[tuple[bytes, bytes], bytes] = {}  # by revision and part
         self._wanted: asyncio.Queue[bytes] = asyncio.Queue(1)  # the part of a rest; empty: a part
-        self._making: bytes | None = None
+        self._making: bytes | None = None  # what was wanted, likewise
 
     def _is_long(self, stored: HandOut) -> bool:
         """Whether a map has parts; a first one is a frame of each drone: less of it is none."""
@@ -80,11 +80,8 @@ class MapParts:
             return not sent.has_arrived
         if not self._is_long(stored):
             return False
-        current = self._maps.current
-        if current is None or current.revision != stored.revision:
-            return True  # it is about to be in use
         if self._of[0] != stored.revision:
-            self._want(b"")
+            self._want(stored, b"")
             return True
         blob = self._of[1]
         if blob:
@@ -110,11 +107,10 @@ class MapParts:
         return self._rest(stored, sent)
 
     def _rest(self, stored: HandOut, sent: _Sent) -> bytes | None:
-        """Return what a map has beyond a part; None while it, or the map in use, is being made."""
+        """Return what a map has beyond a part; None while it is being made."""
         rest = self._rests.get((stored.revision, sent.blob))
-        current = self._maps.current
-        if rest is None and current is not None and current.revision == stored.revision:
-            self._want(sent.blob)
+        if rest is None:
+            self._want(stored, sent.blob)
         return rest
 
     def delivered(self, peer: int, transfer_id: int, now_s: float) -> None:
@@ -153,6 +149,9 @@ class MapParts:
         while len(self._rests) > _N_RESTS:
             del self._rests[next(iter(self._rests))]
 
-    def _want(self, part: bytes) -> None:
-        if part != self._making and not self._wanted.full():
+    def _want(self, stored: HandOut, part: bytes) -> None:
+        """Have a part, or a rest, of a map made; not before that is in use, as it soon is."""
+        current = self._maps.current
+        is_in_use = current is not None and current.revision == stored.revision
+        if is_in_use and part != self._making and not self._wanted.full():
             self._wanted.put_nowait(part)

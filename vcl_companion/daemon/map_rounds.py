@@ -31,6 +31,7 @@ from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.novelty import NEAR_DEG
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.swarm.group import Group
+from vcl_companion.swarm.pace import look_s
 from vcl_companion.swarm.updates import UpdateOptions, UpdateTrigger
 from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.messages import FrameRequest
@@ -39,7 +40,6 @@ _log = logging.getLogger(__name__)
 
 # Percent of an update.
 _GATHERING, _BUILDING, _NO_UPDATE = 20, 60, 255
-_LOOK_S, _LONGEST_LOOK_S = 0.1, 0.5
 # A camera that delivers nothing new has nothing for a map either.
 _STALE_NS = 60 * 1_000_000_000
 
@@ -168,9 +168,9 @@ class MapRounds:
         while True:
             self._trigger.poll(self._now_s())
             stored, frame = self._maps.current, self._untried()
-            look_s = min(_LOOK_S * self._group.stretch, _LONGEST_LOOK_S)
+            pause_s = look_s(self._group.stretch)
             if frame is None:
-                await asyncio.sleep(look_s)
+                await asyncio.sleep(pause_s)
             elif stored is None and self._is_first_due(began_at_s):
                 self._tried = frame
                 await self._first_map(frame)
@@ -182,7 +182,7 @@ class MapRounds:
                     self.progress, self.is_asked = _NO_UPDATE, False
                 self._trigger.ended(self._now_s(), from_new_places=self._is_from_new_places)
             else:
-                await asyncio.sleep(look_s)
+                await asyncio.sleep(pause_s)
 
     def _is_due(self) -> bool:
         if self._is_merging():
@@ -355,7 +355,7 @@ class MapRounds:
         """Wait until everybody alive has a revision, as long as a round would."""
         until_s = self._now_s() + self._options.update.delivery_wait_s
         while self._group.lacking() and not self._is_past(stored) and self._now_s() < until_s:
-            await asyncio.sleep(_LOOK_S)
+            await asyncio.sleep(look_s(self._group.stretch))
 
     async def _updated(
         self, stored: StoredMap, frames: list[FrameAnswer] | NoMap, *, at_once: bool

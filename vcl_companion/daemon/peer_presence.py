@@ -61,7 +61,6 @@ class PeerPresence:
         before = self._group.state_of(peer)
         if before is not None and before.revision and not state.revision:
             self._forgot(peer)
-            self._clocks.joined(peer)
         self._note(self._group.map_state(peer, state, self._now_s()))
         return before is None or state.is_news_after(before)
 
@@ -76,16 +75,16 @@ class PeerPresence:
             _log.info("drone %d %s", event.peer, "joined" if joined else "is silent")
             if joined:
                 self._forgot(event.peer)
-                self._clocks.joined(event.peer)
                 self._own_state.joined()
             else:
                 self._passed.forgot(event.peer)
                 self._inter.lost(event.peer)
 
     def _forgot(self, peer: int) -> None:
-        """Note that a peer may have lost what it was sent: it was restarted, or away."""
+        """Note that a peer may have lost what it was sent, and its clock: restarted, or away."""
         self._handing.forgot(peer)
         self._passed.forgot(peer)
+        self._clocks.joined(peer)
 
     def _now_s(self) -> float:
         return asyncio.get_running_loop().time()

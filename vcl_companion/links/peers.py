@@ -177,10 +177,8 @@ class PeerLink:
 
     def _send(self, frame: bytes, target_system: int) -> None:
         address, heard_at_s = self._addresses.get(target_system, (None, 0.0))
-        if (
-            address is None
-            or asyncio.get_running_loop().time() - heard_at_s > self._address_stale_s
-        ):
+        silent_s = asyncio.get_running_loop().time() - heard_at_s
+        if address is None or silent_s > self._address_stale_s:
             self._socket.write(frame)
         else:
             self._socket.write_to(frame, address)

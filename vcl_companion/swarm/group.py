@@ -389,9 +389,9 @@ class Group:
         return heard_at_s + self._timeout_s if self._claims_to_lead(member) else lost_at_s
 
     def _claims_to_lead(self, member: int) -> bool:
-        state = self._states.get(member)
         if member == self.leader:
             return True
+        state = self._states.get(member)
         return state is not None and state.team == self._team and taken_by(state.epoch) == member
 
     def most_others_hold(self, revision: bytes) -> bool:
@@ -417,10 +417,11 @@ class Group:
         self._go_to(self._team_by(roster))
         self._meetings.poll(roster, now_s)
         self._take_term()
-        if self.coordinator != self._led_by:
-            self._led_by, self._led_since_s = self.coordinator, now_s
-        if self.is_coordinator:
-            self._hasty_until_s = max(self._hasty_until_s, now_s + self._timeout_s)
+        led_by = self.coordinator
+        if led_by != self._led_by:
+            self._led_by, self._led_since_s = led_by, now_s
+        if led_by == self.own_id:
+            self._hasty_until_s = now_s + self._timeout_s
         return [PeerLost(peer) for peer in sorted(late)]
 
     def next_poll_s(self) -> float | None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 FULL_PACE_S = 1.0
 # So many drones hear each other's signs of life at full pace for a third of a percent of a core.
 _MOST_AT_FULL_PACE = 16
+_LOOK_S, _LONGEST_LOOK_S = 0.1, 0.5
 
 
 def stretch_of(n_members: int) -> float:
@@ -21,3 +22,8 @@ def stretch_of(n_members: int) -> float:
     life goes by the pace of who gives it.
     """
     return max(1.0, n_members / _MOST_AT_FULL_PACE)
+
+
+def look_s(stretch: float) -> float:
+    """Return how long after one look through all the others the next comes, at such a pace."""
+    return min(_LOOK_S * stretch, _LONGEST_LOOK_S)
