@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from tests.mapping.views import descriptors_of, map_of
-from tests.scenes import Scene, observe
+from tests.scenes import Scene, facade_scene, observe
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.mapping.landmark_map import LandmarkMap
@@ -63,3 +65,13 @@ def seen_from(
     )
     seen = rng.permutation(np.flatnonzero(view.seen[:, 0]))
     return Features(view.observed_px[seen, 0], descriptors[seen])
+
+
+def flat_map(rng: np.random.Generator, half_m: float, n: int = 80) -> LandmarkMap:
+    """A map of n landmarks on a square of a facade 12 m ahead."""
+    scene = facade_scene(rng, n, relief_m=0.0, n_views=3)
+    across = rng.uniform(-half_m, half_m, (n, 2))
+    points = np.column_stack([np.full(n, 12.0), across])
+    cams = [body @ mounting for body, mounting in zip(scene.bodies, scene.mountings, strict=True)]
+    seen = np.stack([scene.camera.project(cam.inverse().apply(points)) for cam in cams], axis=1)
+    return replace(map_of(scene, 0.01), points_world=points, observed_px=seen)

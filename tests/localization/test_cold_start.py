@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 from tests.checks import assert_pose_close, nees
-from tests.localization.maps import index_of, seen_from
+from tests.localization.maps import flat_map, index_of, seen_from
 from tests.localization.painted import BODIES, MOUNTING, Scenery, painted_map, photograph
-from tests.mapping.views import descriptors_of, map_of
-from tests.scenes import PINHOLE, facade_scene
+from tests.mapping.views import descriptors_of
+from tests.scenes import PINHOLE
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_building import build_map
@@ -145,7 +144,7 @@ def test_a_small_flat_thing_gives_the_right_pose_or_none(
     rng = np.random.default_rng(2)
     found = 0
     for angle in np.repeat([0.0, 0.3, 0.6, 0.9], 5):
-        landmark_map = flat(rng, half_m)
+        landmark_map = flat_map(rng, half_m)
         descriptors = descriptors_of(rng, len(landmark_map.points_world))
         yaw_rad, pitch_rad = (0.0, angle) if pitch else (angle, 0.0)
         rotation = matrix_from_euler(0.0, -pitch_rad, yaw_rad)
@@ -163,13 +162,3 @@ def test_a_small_flat_thing_gives_the_right_pose_or_none(
         found += 1
         assert nees(truth.local(fix.world_from_body), fix.covariance())[0] < 35.0
     assert found >= (10 if half_m == 3.0 else 4 if half_m == 2.0 else 0)
-
-
-def flat(rng: np.random.Generator, half_m: float, n: int = 80) -> LandmarkMap:
-    """A map of n landmarks on a square of a facade 12 m ahead."""
-    scene = facade_scene(rng, n, relief_m=0.0, n_views=3)
-    across = rng.uniform(-half_m, half_m, (n, 2))
-    points = np.column_stack([np.full(n, 12.0), across])
-    cams = [body @ mounting for body, mounting in zip(scene.bodies, scene.mountings, strict=True)]
-    seen = np.stack([scene.camera.project(cam.inverse().apply(points)) for cam in cams], axis=1)
-    return replace(map_of(scene, 0.01), points_world=points, observed_px=seen)

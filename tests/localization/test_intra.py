@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.checks import assert_consistent, assert_pose_close
-from tests.localization.maps import Descriptors, index_of, index_of_scene, seen_from
+from tests.localization.maps import Descriptors, flat_map, index_of, index_of_scene, seen_from
 from tests.mapping.views import descriptors_of, map_of
 from tests.scenes import RADIAL_TANGENTIAL, facade_scene, perturbed
 from vcl_companion.geometry.camera import Camera
@@ -440,6 +440,35 @@ def test_a_landmark_known_to_nothing_along_its_ray_is_no_harm(
     features = seen_from(rng, index.landmark_map, descriptors, TRUTH)
     fix = located(features, unsure)
     assert_pose_close(fix.world_from_body, TRUTH, within_m=1e-5, within_rad=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_landmark_that_may_lie_at_the_lens_agrees_with_nothing(seed: int) -> None:
+    # Its own error moves it across the whole image: whatever it is matched to would agree, and
+    # nothing fixes a pose as much as what is so near.
+    rng = np.random.default_rng(seed)
+    landmark_map = flat_map(rng, 6.0, 90)
+    descriptors = descriptors_of(rng, 90)
+    index = index_of(landmark_map, descriptors)
+    truth = Pose(TRUTH.rotation, np.array([-6.0, 0.8, -0.3]))
+    features = seen_from(rng, landmark_map, descriptors, truth, noise_px=0.3)
+    expected = located(features, index, options=UNBIASED)
+    here = rng.choice(90, 12, replace=False)
+    rays = np.column_stack([rng.uniform(-0.2, 0.2, (12, 2)), np.ones(12)])
+    points, own = landmark_map.points_world.copy(), index.uncertainty.landmark_covariance.copy()
+    world_from_cam = truth @ landmark_map.keyframes[0].body_from_cam
+    points[here] = world_from_cam.apply(rng.uniform(-0.6, 0.3, (12, 1)) * rays)
+    own[here] = 0.15**2 * np.eye(3)
+    whole = index.landmark_covariances.copy()
+    whole[here] += own[here]
+    near = replace(
+        index,
+        landmark_map=replace(landmark_map, points_world=points),
+        uncertainty=replace(index.uncertainty, landmark_covariance=own),
+        landmark_covariances=whole,
+    )
+    fix = located(features, near, options=UNBIASED)
+    assert_pose_close(fix.world_from_body, expected.world_from_body, within_m=0.05, within_rad=3e-3)
 
 
 def test_a_feature_where_the_lens_model_has_no_inverse_is_left_out(

@@ -93,6 +93,19 @@ def test_landmarks_behind_the_camera_are_nobodys_inliers() -> None:
     assert not found.inliers[N:].any()
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_wrong_matches_that_lie_close_together_do_not_end_the_search(seed: int) -> None:
+    # A camera far away sees all landmarks in one spot, where most of these matches lie: more than
+    # half agree with that to a hundred px, beyond chance, and the first few samples find it.
+    ideal, points, truth = sighting(seed, 0.7)
+    rng = np.random.default_rng(seed)
+    wrong = rng.permutation(N)[: round(0.8 * N)]
+    ideal[wrong] = 0.15 * rng.standard_normal((len(wrong), 2))
+    found = resect(ideal, points, FOCAL_PX, np.random.default_rng(seed), AcRansacOptions(2000))
+    assert isinstance(found, AbsolutePose)
+    assert_pose_close(found.cam_from_world, truth, within_m=0.2, within_rad=0.02)
+
+
 def test_chance_is_refused_with_a_reason() -> None:
     rng = np.random.default_rng(5)
     ideal = rng.uniform(-1.0, 1.0, (60, 2))

@@ -35,6 +35,8 @@ _LED_LEVERAGE, _FOUND_LEVERAGE = 0.4, 0.25
 # Share of the matches near a right prediction that agree: 0.67 and more on every recording flown.
 # Near a wrong one repeated structure (windows) agreed on a pose 6 m off with a half.
 _LED_SHARE = 0.6
+# A landmark's depth is so many sigmas at least.
+_SURELY = 3.0
 # A pose that rests on single landmarks is taken to be off by so many times what it says.
 _UNDECIDED = 3.0
 
@@ -407,6 +409,18 @@ class _Matcher:
             least = np.where(seen[:, i], np.minimum(least, bias), least)
         return least
 
+    def _in_front(self, world_from_body: Pose, landmarks: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return (M,) which landmarks are surely in front of the camera.
+
+        One that may lie at its very lens may appear anywhere: whatever it was matched to agrees.
+        """
+        world_from_cam = world_from_body @ self.body_from_cam
+        axis = world_from_cam.rotation[:, 2]
+        points = self.index.landmark_map.points_world[landmarks]
+        own = self.index.uncertainty.landmark_covariance[landmarks]
+        depth_m = (points - world_from_cam.translation) @ axis
+        return np.asarray(depth_m > _SURELY * np.sqrt(np.einsum("i,mij,j->m", axis, own, axis)))
+
     def _resection_options(self, max_leverage: float) -> ResectionOptions:
         return ResectionOptions(self.options.min_inliers, max_leverage=max_leverage)
 
@@ -421,5 +435,7 @@ class _Matcher:
         pixels = self.features.pixels[found]
         if isinstance(start, NotFound):
             return _Matched(landmarks, pixels, start)
+        seen = np.where(self._in_front(start, landmarks)[:, None], sightings.ideal, np.nan)
+        sightings = replace(sightings, ideal=seen)
         result = refine(start, sightings, self._resection_options(max_leverage))
         return _Matched(landmarks, pixels, result)

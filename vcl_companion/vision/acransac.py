@@ -39,6 +39,8 @@ _LOG_EDGES = np.log(
 )
 THRESHOLD_SIGMAS = 2.5
 """What a threshold found from the data is taken for, in sigmas of the noise behind it."""
+# A detector's features agree with a right model to so many px, or nearly.
+_PRECISE_PX = 2.5
 _MODELS_PER_BATCH = 64
 _MAX_REFITS = 4
 # One of so many samples is drawn among the inliers of the best model.
@@ -166,6 +168,17 @@ class FalseAlarms:
             self._largest, _LOG_EDGES, np.zeros(len(_LOG_EDGES), dtype=np.int64),
         )  # fmt: skip
 
+    def fewest_better(self, score: Score) -> int:
+        """Return how few matches mean more than a score does, if they agree as a right model's do.
+
+        Where matches lie close together, half of them may agree with a wrong model to a hundred
+        px, beyond chance: they say nothing of how many agree with the right one.
+        """
+        squared = min(score.threshold_squared, _PRECISE_PX**2)
+        log_alpha = min(self._log_alpha + self._half_dimension * np.log(squared), 0.0)
+        log_nfa = self._log_tests + (np.arange(len(self._log_tests)) - self._s) * log_alpha
+        return int(np.argmax(log_nfa <= score.log_nfa))
+
     def best(self, squared_errors: Array, nfa: str) -> tuple[int, Score]:
         """Return which of K models, (K, N) squared errors, is most meaningful, and its score."""
         index, k, threshold_squared, log_nfa = _best_model(
@@ -222,7 +235,8 @@ def ac_ransac(
         if score.log_nfa < 0.0:
             errors = problem.squared_errors(model[None])[0]
             pool = np.flatnonzero(errors <= score.threshold_squared)
-            needed = min(options.max_samples, _samples_needed(len(pool), n, s, options.confidence))
+            least = min(len(pool), alarms.fewest_better(score))
+            needed = min(options.max_samples, _samples_needed(least, n, s, options.confidence))
     if best is None or best[1].log_nfa >= 0.0:
         return NotFound(f"no more of the {n} matches agree than wrong ones would by chance")
     model, score = best
