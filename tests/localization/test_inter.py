@@ -204,6 +204,30 @@ def test_a_match_whose_word_nobody_checks_is_not_taken(rng: np.random.Generator)
     assert np.max(nees(errors, np.array(covariances))) < 4.0
 
 
+def test_wrong_matches_that_lie_together_are_told_as_a_wide_error(rng: np.random.Generator) -> None:
+    """Far away, a step up and a nod down look alike; a shadow that moved decides between them."""
+    scene = index_of_scene(rng, facade_scene(rng, 600, relief_m=0.5, n_views=3))
+    errors, covariances = [], []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        here, there = (
+            seen_from(rng, scene[0].landmark_map, scene[1], pose, noise_px=0.3)
+            for pose in (HOST, TARGET)
+        )
+        pixels = there.pixels.copy()
+        corner = rng.uniform((60.0, 40.0), (460.0, 320.0))
+        moved = ((pixels > corner) & (pixels < corner + 120.0)).all(axis=1)
+        pixels[moved, 1] += rng.choice([-1.2, 1.2])
+        moved_there = observer(scene, Features(pixels, there.descriptors), None)
+        found = localize_inter(
+            observer(scene, here, HOST), HOST, SURE, moved_there, scene[0], OPTIONS
+        )
+        assert isinstance(found, Proposal), found
+        errors.append(TARGET.local(found.world_from_body))
+        covariances.append(found.covariance)
+    assert np.max(nees(errors, np.array(covariances))) < 8.0
+
+
 def test_a_proposal_too_vague_is_not_made(rng: np.random.Generator, relief: Scene) -> None:
     found = proposed(rng, relief, noise_px=0.5, options=InterOptions(max_sigma_m=1e-3))
     assert isinstance(found, NoProposal)

@@ -14,16 +14,20 @@ from numpy.typing import NDArray
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, about_down, heading_of, log_so3
+from vcl_companion.geometry.rotation import Array, about_down, heading_of, log_so3, skew
+from vcl_companion.localization.jackknife import jackknife, no_less_than
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.vision.bundle import linearized
-from vcl_companion.vision.essential import sampson_px
+from vcl_companion.vision.epipolar import signed_sampson
 from vcl_companion.vision.features import Features
 from vcl_companion.vision.information import covariance_of
 
 _STEP = 1e-6
+_NUDGES = _STEP * np.eye(6)
 # One match may decide this much of the pose.
 _MAX_LEVERAGE = 0.4
+# Without so many common landmarks there is no scale.
+_LEAST_LANDMARKS = 4
 # Smallest eigenvalue of a normal matrix, scaled to a diagonal of ones, that is no rounding.
 _SINGULAR = 1e-9
 # Normalised squares beyond these are no noise: 3 sigma, 99.9 % of chi^2 with 2 and with 3
@@ -97,6 +101,10 @@ class Agreement:
     epipolar: NDArray[np.bool_]
     landmark: NDArray[np.bool_]
 
+    def among(self, kept: NDArray[np.bool_]) -> Agreement:
+        """Return those among some."""
+        return Agreement(self.epipolar & kept, self.landmark & kept)
+
     def same(self, other: Agreement) -> bool:
         """Return whether the same matches agree."""
         return np.array_equal(self.epipolar, other.epipolar) and np.array_equal(
@@ -138,16 +146,15 @@ class PairEvidence:
 
     def agreeing(self, pose: Pose) -> Agreement:
         """Return who agrees with a pose; a match off its landmark may still lie on its line."""
-        everyone = np.ones(len(self.landmarks), dtype=np.bool_)
-        on_line = (self._epipolar_px(pose, everyone) / self.options.noise_floor_px) ** 2 < _EPIPOLAR
+        on_line = self._line_squares(pose) < _EPIPOLAR
         landmark = self.known(on_line)
         landmark[landmark] = self._landmark_squares(pose, landmark) < _LANDMARK
         return Agreement(on_line & ~landmark, landmark)
 
     def cost(self, pose: Pose) -> float:
         """Return the truncated squares of all evidence, the same evidence for every pose."""
+        epipolar = self._line_squares(pose)
         everyone = np.ones(len(self.landmarks), dtype=np.bool_)
-        epipolar = (self._epipolar_px(pose, everyone) / self.options.noise_floor_px) ** 2
         landmark = self._landmark_squares(pose, self.known(everyone))
         cost = float(np.minimum(epipolar, _EPIPOLAR).sum())
         cost += float(np.minimum(landmark, _LANDMARK).sum())
@@ -161,7 +168,7 @@ class PairEvidence:
         """Return the pose of least squares over the matches that agree, from one nearby."""
         pose = start
         for _ in range(8):
-            normal, rhs, _, _ = self._system(pose, chosen)
+            normal, rhs = self._system(pose, chosen)
             step = np.asarray(np.linalg.lstsq(normal, rhs, rcond=1e-12)[0], dtype=np.float64)
             if not np.all(np.isfinite(step)) or np.linalg.norm(step) > 10.0:
                 return start
@@ -173,25 +180,38 @@ class PairEvidence:
     def covariance(self, pose: Pose, chosen: Agreement, host_covariance: Array) -> Array:
         """Return (6, 6) of the target's pose: pixels, landmarks, the host's own error (eq. 9).
 
+        No smaller than what the pose shows without parts of the target's image (``jackknife``).
         Infinite where the matches do not fix it.
         """
-        normal, _, by_host, lever = self._system(pose, chosen)
+        normal, _ = self._system(pose, chosen)
         inverse = covariance_of(normal, _SINGULAR)
         if inverse is None:
             return np.full((6, 6), np.inf)
-        through = -inverse @ by_host
-        shared = -inverse @ lever
+        through = -inverse @ self._by_host(pose, chosen)
+        shared = -inverse @ self._by_keyframes(pose, chosen)
         keyframes = self.index.uncertainty.keyframe_covariance
-        return np.asarray(
-            inverse + through @ host_covariance @ through.T + shared @ keyframes @ shared.T
+        of_matches = no_less_than(
+            inverse + shared @ keyframes @ shared.T, self._jackknife(pose, chosen)
         )
+        return np.asarray(of_matches + through @ host_covariance @ through.T)
+
+    def _jackknife(self, pose: Pose, chosen: Agreement) -> Array:
+        def without(kept: NDArray[np.bool_]) -> Pose | None:
+            agreeing = chosen.among(kept)
+            if agreeing.landmark.sum() < _LEAST_LANDMARKS:
+                return None
+            moved = self.refined(pose, agreeing)
+            return self.refined(moved, self.agreeing(moved).among(kept))
+
+        used = chosen.epipolar | chosen.landmark
+        return jackknife(pose, self.ideal_target, used, without)
 
     def undecisive(self, pose: Pose, chosen: Agreement) -> Agreement:
         """Return those that agree without the ones that nearly decide the pose alone.
 
         Such a one agrees with whatever pose it leads to: nothing checks its word.
         """
-        normal, _, _, _ = self._system(pose, chosen)
+        normal, _ = self._system(pose, chosen)
         inverse = covariance_of(normal, _SINGULAR)
         if inverse is None:
             return chosen
@@ -206,15 +226,13 @@ class PairEvidence:
         landmark[landmark] = in_place * _weight(squared) <= _MAX_LEVERAGE
         return Agreement(epipolar, landmark)
 
-    def _system(self, pose: Pose, chosen: Agreement) -> tuple[Array, Array, Array, Array]:
-        """Return normal matrix, right side, its slopes by host (6, 6) and keyframes (6, 6V)."""
+    def _system(self, pose: Pose, chosen: Agreement) -> tuple[Array, Array]:
+        """Return normal matrix and right side of the pose."""
         sigma_px = self._sigma_px(pose)
-        normal, rhs, lever = self._by_landmarks(pose, chosen.landmark, sigma_px)
+        weighted, residual, j_pose, _ = self._places(pose, chosen.landmark, sigma_px)
+        normal = np.einsum("nik,nkj->ij", weighted, j_pose)
+        rhs = -np.einsum("nik,nk->i", weighted, residual)
         error, by_pose, weight = self._lines(pose, chosen.epipolar, sigma_px)
-        by_host = np.empty((len(error), 6))
-        for k, nudge in enumerate(_STEP * np.eye(6)):
-            moved = self._epipolar_px(pose, chosen.epipolar, self.host_pose.retracted(nudge))
-            by_host[:, k] = (moved - error) / _STEP
         normal += (by_pose * weight[:, None]).T @ by_pose
         rhs -= (by_pose * weight[:, None]).T @ error
         attitude = self._attitude(pose)
@@ -223,17 +241,30 @@ class PairEvidence:
             information = information / (1.0 + float(off @ information @ off) / _ATTITUDE) ** 2
             normal[3:, 3:] += information
             rhs[3:] -= information @ off
-        return normal, rhs, (by_pose * weight[:, None]).T @ by_host, lever
+        return normal, rhs
+
+    def _by_host(self, pose: Pose, chosen: Agreement) -> Array:
+        """Return (6, 6) how the right side goes with the host's pose, by its epipolar lines."""
+        error, by_pose, weight = self._lines(pose, chosen.epipolar, self._sigma_px(pose))
+        hosts = [self.host_pose.retracted(nudge) for nudge in _NUDGES]
+        moved = self._epipolar_px([self._target_from_host(pose, h) for h in hosts], chosen.epipolar)
+        return np.asarray((by_pose * weight[:, None]).T @ ((moved - error) / _STEP).T)
+
+    def _by_keyframes(self, pose: Pose, chosen: Agreement) -> Array:
+        """Return (6, 6V) how the right side goes with the map's keyframes, by their landmarks."""
+        weighted, _, _, j_point = self._places(pose, chosen.landmark, self._sigma_px(pose))
+        levers = self.index.uncertainty.landmark_lever[self.landmarks[chosen.landmark]]
+        by_point = weighted @ j_point
+        return np.asarray(np.tensordot(by_point, levers, axes=((0, 2), (0, 1))))
 
     def _lines(
         self, pose: Pose, chosen: NDArray[np.bool_], sigma_px: Array
     ) -> tuple[Array, Array, Array]:
         """Return how far off their lines (K,) matches are, slopes by pose (K, 6), weights (K,)."""
-        error = self._epipolar_px(pose, chosen)
-        by_pose = np.empty((len(error), 6))
-        for k, nudge in enumerate(_STEP * np.eye(6)):
-            by_pose[:, k] = (self._epipolar_px(pose.retracted(nudge), chosen) - error) / _STEP
-        sigma = sigma_px[chosen]
+        poses = [pose, *(pose.retracted(nudge) for nudge in _NUDGES)]
+        errors = self._epipolar_px([self._target_from_host(p) for p in poses], chosen)
+        error, sigma = errors[0], sigma_px[chosen]
+        by_pose = ((errors[1:] - error) / _STEP).T
         return error, by_pose, _weight((error / sigma) ** 2) / sigma**2
 
     def _attitude(self, pose: Pose) -> tuple[Array, Array] | None:
@@ -255,6 +286,12 @@ class PairEvidence:
             _parallax(self._target_from_host(pose), self.ideal_host, self.ideal_target)
         )
         return np.hypot(self.options.noise_floor_px, self.options.bias_px_per_deg * turn_deg)
+
+    def _line_squares(self, pose: Pose) -> Array:
+        """Return (M,) squared distances of all matches from their epipolar lines, in noise."""
+        everyone = np.ones(len(self.landmarks), dtype=np.bool_)
+        distance_px = self._epipolar_px([self._target_from_host(pose)], everyone)[0]
+        return np.asarray((distance_px / self.options.noise_floor_px) ** 2)
 
     def _landmark_squares(self, pose: Pose, chosen: NDArray[np.bool_]) -> Array:
         """Return (K,) squared normalised errors of landmarks in the target's image."""
@@ -279,30 +316,35 @@ class PairEvidence:
         covariance[:, [0, 1], [0, 1]] += sigma_px[chosen, None] ** 2
         return residual, np.asarray(np.linalg.inv(covariance)), j_pose, j_point
 
-    def _by_landmarks(
+    def _places(
         self, pose: Pose, chosen: NDArray[np.bool_], sigma_px: Array
-    ) -> tuple[Array, Array, Array]:
-        """Return the landmarks' part: where they appear in the target's image."""
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return where landmarks appear in the target's image, weighed.
+
+        Returns:
+            (K, 6, 2) slopes by the pose times information and robust weight; residuals (K, 2)
+            and their slopes by pose (K, 2, 6) and point (K, 2, 3).
+        """
         residual, information, j_pose, j_point = self._sightings(pose, chosen, sigma_px)
         squared = np.einsum("nk,nkl,nl->n", residual, information, residual)
-        weighted = np.einsum("nki,nkl->nil", j_pose, information)
+        weighted = np.swapaxes(j_pose, 1, 2) @ information
         weighted *= _weight(squared)[:, None, None]
-        levers = self.index.uncertainty.landmark_lever[self.landmarks[chosen]]
-        lever = np.einsum("nil,nlj,njk->ik", weighted, j_point, levers)
-        normal = np.einsum("nik,nkj->ij", weighted, j_pose)
-        return normal, -np.einsum("nik,nk->i", weighted, residual), lever
+        return weighted, residual, j_pose, j_point
 
     def _target_from_host(self, pose: Pose, host_pose: Pose | None = None) -> Pose:
         world_from_host = (host_pose or self.host_pose) @ self.host.body_from_cam
         return (pose @ self.target.body_from_cam).inverse() @ world_from_host
 
-    def _epipolar_px(
-        self, pose: Pose, chosen: NDArray[np.bool_], host_pose: Pose | None = None
-    ) -> Array:
-        relative = self._target_from_host(pose, host_pose)
-        length = max(float(np.linalg.norm(relative.translation)), 1e-9)
-        unit = Pose(relative.rotation, relative.translation / length)
-        return sampson_px(unit, self.ideal_host[chosen], self.ideal_target[chosen], self.focal_px)
+    def _epipolar_px(self, targets_from_hosts: list[Pose], chosen: NDArray[np.bool_]) -> Array:
+        """Return (P, K) signed distances from the epipolar lines by P relative poses, px."""
+        essentials = np.stack([_essential(pose) for pose in targets_from_hosts])
+        a, b = self.ideal_host[chosen], self.ideal_target[chosen]
+        return signed_sampson(essentials, a, b, self.focal_px)
+
+
+def _essential(b_from_a: Pose) -> Array:
+    length = max(float(np.linalg.norm(b_from_a.translation)), 1e-9)
+    return np.asarray(skew(b_from_a.translation / length) @ b_from_a.rotation)
 
 
 def _weight(squared: Array) -> Array:

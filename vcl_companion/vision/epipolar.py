@@ -8,6 +8,8 @@ along with the pose (expectation maximisation).
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from vcl_companion.geometry.rotation import Array
@@ -44,6 +46,24 @@ def squared_sampson(essentials: Array, a: Array, b: Array, focal_px: float) -> A
             product = u * line_x + v * line_y + e20 * x + e21 * y + e22
             slope = line_x * line_x + line_y * line_y + back_x * back_x + back_y * back_y
             out[k, i] = scale * product * product / max(slope, 1e-300)
+    return out
+
+
+@compiled
+def signed_sampson(essentials: Array, a: Array, b: Array, focal_px: float) -> Array:
+    """Return (K, N) Sampson distances with the sign of b^T E a, px; see ``squared_sampson``."""
+    out = np.empty((len(essentials), len(a)))
+    for k in range(len(essentials)):
+        e = essentials[k]
+        for i in range(len(a)):
+            x, y, u, v = a[i, 0], a[i, 1], b[i, 0], b[i, 1]
+            line_x = e[0, 0] * x + e[0, 1] * y + e[0, 2]
+            line_y = e[1, 0] * x + e[1, 1] * y + e[1, 2]
+            back_x = e[0, 0] * u + e[1, 0] * v + e[2, 0]
+            back_y = e[0, 1] * u + e[1, 1] * v + e[2, 1]
+            product = u * line_x + v * line_y + e[2, 0] * x + e[2, 1] * y + e[2, 2]
+            slope = line_x * line_x + line_y * line_y + back_x * back_x + back_y * back_y
+            out[k, i] = focal_px * product / max(math.sqrt(slope), 1e-12)
     return out
 
 

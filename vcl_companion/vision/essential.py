@@ -15,6 +15,7 @@ import numpy as np
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, skew
 from vcl_companion.vision.acransac import AcRansacOptions
+from vcl_companion.vision.epipolar import signed_sampson
 from vcl_companion.vision.information import robust_sigma
 from vcl_companion.vision.relative_pose import essential_candidates
 from vcl_companion.vision.triangulation import triangulate
@@ -103,12 +104,9 @@ def relative_poses(
 def sampson_px(b_from_a: Pose, ideal_a: Array, ideal_b: Array, focal_px: float) -> Array:
     """Return (M,) signed first-order epipolar distances, px."""
     essential = skew(b_from_a.translation) @ b_from_a.rotation
-    a = np.hstack([ideal_a, np.ones((len(ideal_a), 1))])
-    b = np.hstack([ideal_b, np.ones((len(ideal_b), 1))])
-    lines_b = a @ essential.T
-    lines_a = b @ essential
-    slope = np.sqrt((lines_a[:, :2] ** 2).sum(axis=1) + (lines_b[:, :2] ** 2).sum(axis=1))
-    return np.asarray(focal_px * np.einsum("ni,ni->n", b, lines_b) / np.maximum(slope, 1e-12))
+    # A kernel is compiled once more for arrays that may not be written.
+    a, b = np.array(ideal_a), np.array(ideal_b)
+    return np.asarray(signed_sampson(essential[None], a, b, focal_px)[0])
 
 
 def _translation_only(a: Array, b: Array, rotation: Array) -> Pose:
