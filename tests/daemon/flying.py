@@ -50,9 +50,15 @@ class Flier:
 
 @contextlib.asynccontextmanager
 async def flying(
-    drone: Drone, localization: LocalizationOptions | None = None
+    drone: Drone,
+    localization: LocalizationOptions | None = None,
+    *,
+    searching: LocalizationOptions | None = None,
 ) -> AsyncIterator[Flier]:
-    """Fly a drone that was started; ``STARVED`` for one that sees too little."""
+    """Fly a drone that was started; ``STARVED`` for one that sees too little.
+
+    ``searching`` is by what a frame is looked for on the whole map, if that is another one.
+    """
     options = PipelineOptions(
         demo.FEATURES, localization or LocalizationOptions(), TrackingOptions()
     )
@@ -64,7 +70,9 @@ async def flying(
         stack.push_async_callback(server.close)
         camera = StreamCamera("127.0.0.1", port, size_px, drone.clock)
         stack.push_async_callback(camera.close)
-        work = MapWork(demo.workshop(SwarmOptions(), sensor, INTER, localization), forks=False)
+        work = MapWork(
+            demo.workshop(SwarmOptions(), sensor, INTER, searching or localization), forks=False
+        )
         stack.callback(work.end)
         health = Health(drone.autopilot_link, drone.log)
         companion = Companion(

@@ -90,6 +90,30 @@ def test_a_target_that_sees_too_little_gets_its_pose_through_a_host(tmp_path: Pa
     run(scenario())
 
 
+def test_led_by_a_host_a_lost_target_places_the_frame_by_its_own_patches(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            host = await members.start(1, MAP, inter=replace(INTER, every_n_frames=0))
+            target = await members.start(2, MAP, inter=PATIENT)
+            async with flying(host) as one, flying(target, searching=STARVED) as two:
+                one.give(0)
+                await one.server.answered()
+                await knows_of(target, 1)
+                two.give(0)
+                await two.server.answered()
+                assert two.sources() == [(0, "localized", "intra")]
+                assert two.bases() == [(0, "patches")]
+                led, own = target.lines("estimate")
+                assert (led["source"], led["fused"]) == ("inter", True)
+                assert (own["source"], own["fused"]) == ("intra", True)
+                truth = demo.world_from_body(2, 0).translation
+                off_m = [np.linalg.norm(np.array(line["position"]) - truth) for line in (led, own)]
+                assert off_m[1] < off_m[0]
+                assert off_m[1] < 0.05
+
+    run(scenario())
+
+
 def test_a_localized_drone_asks_now_and_then_and_is_confirmed(tmp_path: Path) -> None:
     async def scenario() -> None:
         async with swarm(1, 2, path=tmp_path) as members:

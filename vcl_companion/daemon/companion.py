@@ -236,14 +236,20 @@ class Companion:
 
     async def _look_again(self, frame: Frame, refused: NotLocalized) -> None:
         """Answer a frame by what is known by now of where it was taken: later ones have been."""
+        if not await self._is_placed_by_patches(frame):
+            self._give_up(frame, refused)
+
+    async def _is_placed_by_patches(self, frame: Frame) -> bool:
+        """Look at a frame once more, from where it is believed by now; answer it if that helps."""
         stored = self._maps.current
-        if stored is not None and stored.templates is not None:
-            ned_from_body = await self._attitude_of(frame)
-            fix = await self._looked_at(frame, stored, ned_from_body, _PATCHES_ALONE)
-            if self._take(frame, fix, ned_from_body) is None:
-                self._outcomes.close(frame)
-                return
-        self._give_up(frame, refused)
+        if stored is None or stored.templates is None:
+            return False
+        ned_from_body = await self._attitude_of(frame)
+        fix = await self._looked_at(frame, stored, ned_from_body, _PATCHES_ALONE)
+        if isinstance(fix, NotLocalized) or self._take(frame, fix, ned_from_body) is not None:
+            return False
+        self._outcomes.close(frame)
+        return True
 
     async def _ask(
         self,
@@ -332,7 +338,8 @@ class Companion:
             self._outcomes.close(asked.frame, None if state is None else "fused")
         elif state is None:
             again = await self._given_up(asked.frame, open_frame.stored(), refused)
-        else:
+        elif not await self._is_placed_by_patches(asked.frame):
+            # Led by what peers said, the frame's own patches would have told it more closely.
             unsent = self._send(asked.frame, state, "inter", "peer")
             if unsent is None:
                 self._outcomes.close(asked.frame)
