@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from tests.localization.maps import Descriptors, index_of_scene, seen_from
 from tests.mapping.views import descriptors_of
 from tests.scenes import facade_scene, perturbed
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import about_down, exp_so3, matrix_from_euler
+from vcl_companion.geometry.rotation import Array, about_down, exp_so3, matrix_from_euler
 from vcl_companion.localization.inter import NoProposal, Proposal, localize_inter
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pair_evidence import InterOptions, Observer
@@ -180,52 +181,53 @@ def test_without_a_common_north_only_roll_and_pitch_are_weighed(
     assert np.linalg.det(alone.covariance) >= np.linalg.det(known.covariance)
 
 
-def test_a_match_whose_word_nobody_checks_is_not_taken(rng: np.random.Generator) -> None:
-    """All but one match lie close together; that one lies far off, wrong along its line."""
-    scene = index_of_scene(rng, facade_scene(rng, 600, relief_m=1.0, n_views=3))
+def nees_of_changed(
+    scene: Scene, n: int, changed: Callable[[np.random.Generator, Features], Features]
+) -> Array:
+    """Return (n,) how far proposals are off, where what the target saw is changed somehow."""
     errors, covariances = [], []
-    for seed in range(12):
+    for seed in range(n):
         rng = np.random.default_rng(seed)
         here, there = (
             seen_from(rng, scene[0].landmark_map, scene[1], pose, noise_px=0.3)
             for pose in (HOST, TARGET)
         )
+        target = observer(scene, changed(rng, there), None)
+        found = localize_inter(observer(scene, here, HOST), HOST, SURE, target, scene[0], OPTIONS)
+        assert isinstance(found, Proposal), found
+        errors.append(TARGET.local(found.world_from_body))
+        covariances.append(found.covariance)
+    return nees(errors, np.array(covariances))
+
+
+def test_a_match_whose_word_nobody_checks_is_not_taken(rng: np.random.Generator) -> None:
+    """All but one match lie close together; that one lies far off, wrong along its line."""
+    scene = index_of_scene(rng, facade_scene(rng, 600, relief_m=1.0, n_views=3))
+
+    def narrow(_: np.random.Generator, there: Features) -> Features:
         x, y = there.pixels.T
         alone = int(np.argmax(x))
         kept = (np.abs(x - 200.0) < 60.0) & (np.abs(y - 240.0) < 90.0)
         kept[alone] = True
         pixels = there.pixels.copy()
         pixels[alone, 0] -= 4.0
-        narrow = observer(scene, Features(pixels[kept], there.descriptors[kept]), None)
-        found = localize_inter(observer(scene, here, HOST), HOST, SURE, narrow, scene[0], OPTIONS)
-        assert isinstance(found, Proposal), found
-        errors.append(TARGET.local(found.world_from_body))
-        covariances.append(found.covariance)
-    assert np.max(nees(errors, np.array(covariances))) < 4.0
+        return Features(pixels[kept], there.descriptors[kept])
+
+    assert np.max(nees_of_changed(scene, 12, narrow)) < 4.0
 
 
 def test_wrong_matches_that_lie_together_are_told_as_a_wide_error(rng: np.random.Generator) -> None:
     """Far away, a step up and a nod down look alike; a shadow that moved decides between them."""
     scene = index_of_scene(rng, facade_scene(rng, 600, relief_m=0.5, n_views=3))
-    errors, covariances = [], []
-    for seed in range(16):
-        rng = np.random.default_rng(seed)
-        here, there = (
-            seen_from(rng, scene[0].landmark_map, scene[1], pose, noise_px=0.3)
-            for pose in (HOST, TARGET)
-        )
+
+    def moved(rng: np.random.Generator, there: Features) -> Features:
         pixels = there.pixels.copy()
         corner = rng.uniform((60.0, 40.0), (460.0, 320.0))
-        moved = ((pixels > corner) & (pixels < corner + 120.0)).all(axis=1)
-        pixels[moved, 1] += rng.choice([-1.2, 1.2])
-        moved_there = observer(scene, Features(pixels, there.descriptors), None)
-        found = localize_inter(
-            observer(scene, here, HOST), HOST, SURE, moved_there, scene[0], OPTIONS
-        )
-        assert isinstance(found, Proposal), found
-        errors.append(TARGET.local(found.world_from_body))
-        covariances.append(found.covariance)
-    assert np.max(nees(errors, np.array(covariances))) < 8.0
+        inside = ((pixels > corner) & (pixels < corner + 120.0)).all(axis=1)
+        pixels[inside, 1] += rng.choice([-1.2, 1.2])
+        return Features(pixels, there.descriptors)
+
+    assert np.max(nees_of_changed(scene, 16, moved)) < 8.0
 
 
 def test_a_proposal_too_vague_is_not_made(rng: np.random.Generator, relief: Scene) -> None:
