@@ -207,6 +207,23 @@ def test_the_exact_nfa_is_the_definition(errors: list[float]) -> None:
         assert ordered[score.k - 1] == pytest.approx(score.threshold_squared)
 
 
+@given(st.lists(st.floats(1e-3, 1e5), min_size=3, max_size=20, unique=True))
+def test_no_more_are_needed_to_mean_more_than_agree_and_fewer_if_they_agree_better(
+    errors: list[float],
+) -> None:
+    alarms = FalseAlarms(Lines(np.zeros((len(errors), 2))))
+    score = alarms.exact(np.array(errors))
+    if not math.isfinite(score.log_nfa):
+        return
+    fewest = alarms.fewest_better(score)
+    assert 2 < fewest <= score.k
+    if score.threshold_squared <= 1.0:
+        assert fewest == score.k
+    exact = np.full(len(errors), 1e6)
+    exact[:fewest] = min(score.threshold_squared, 1.0)
+    assert alarms.exact(exact).log_nfa <= score.log_nfa + 1e-9
+
+
 def test_errors_that_are_no_numbers_are_nobodys_inliers() -> None:
     errors = np.array([1e-4] * 10 + [np.nan, -np.nan, np.inf])
     alarms = FalseAlarms(Lines(np.zeros((13, 2))))

@@ -177,7 +177,8 @@ class FalseAlarms:
         squared = min(score.threshold_squared, _PRECISE_PX**2)
         log_alpha = min(self._log_alpha + self._half_dimension * np.log(squared), 0.0)
         log_nfa = self._log_tests + (np.arange(len(self._log_tests)) - self._s) * log_alpha
-        return int(np.argmax(log_nfa <= score.log_nfa))
+        better = np.flatnonzero(log_nfa <= score.log_nfa)
+        return min(int(better[0]), score.k) if len(better) else score.k
 
     def best(self, squared_errors: Array, nfa: str) -> tuple[int, Score]:
         """Return which of K models, (K, N) squared errors, is most meaningful, and its score."""
@@ -235,7 +236,7 @@ def ac_ransac(
         if score.log_nfa < 0.0:
             errors = problem.squared_errors(model[None])[0]
             pool = np.flatnonzero(errors <= score.threshold_squared)
-            least = min(len(pool), alarms.fewest_better(score))
+            least = alarms.fewest_better(score)
             needed = min(options.max_samples, _samples_needed(least, n, s, options.confidence))
     if best is None or best[1].log_nfa >= 0.0:
         return NotFound(f"no more of the {n} matches agree than wrong ones would by chance")
