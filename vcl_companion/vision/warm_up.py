@@ -14,6 +14,7 @@ from vcl_companion.geometry.rotation import Array
 from vcl_companion.vision import pose_errors, pose_kernels
 from vcl_companion.vision.absolute_pose import resect
 from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust, point_information
+from vcl_companion.vision.essential import sampson_px
 from vcl_companion.vision.features import Features
 from vcl_companion.vision.guided_pairs import match_epipolar
 from vcl_companion.vision.hamming import hamming_index, nearest_two
@@ -48,6 +49,7 @@ def warm_up() -> None:
     nearest_two(descriptors, hamming_index(descriptors, np.arange(40)))
     still = Features(320.0 * ideal_a, descriptors)
     b_from_a = Pose(np.eye(3), np.array([1.0, 0.2, 0.1]))
+    sampson_px(b_from_a, ideal_a, ideal_b, 320.0)
     match_epipolar(still, still, ideal_a, ideal_b, b_from_a, (0.1, 0.3), 320.0)
     _adjust(points)
     _track(rng)
