@@ -3,8 +3,10 @@
 What repeats, as windows do, is taken for the next one, and then lies far behind or before what is
 beside it. A few of those bend the poses until they fit them by some tenths of a pixel, for the
 farthest landmarks are what a turn is known by. So a pair's pose is found again of those alone that
-lie as deep as their neighbours, and whatever misses its epipolar lines is told. What is wrong
-along them is not found, and bends nothing.
+lie as deep as their neighbours, and whatever misses its epipolar lines is told. Before a flat wall
+that pose is known so little that hardly one of them does; but together they miss it by more than
+they could if they were right, and the fewer can be the less is believed of each. What is wrong
+along the lines is not found, and bends nothing.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.special import expit
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
@@ -34,6 +37,16 @@ _SHARE = 0.5
 _NOISE_PX = 0.3
 # What misses by more is wrong: sigmas, of no less than so many px.
 _STRAY_SIGMAS, _LEAST_SIGMA_PX = 4.0, 0.075
+# Landmarks that nothing beside them is as deep as are right, and miss by a sigma, or wrong, and
+# miss by at least so many. How many are wrong is found of themselves: before that, one in five.
+_WRONG_SIGMAS = 2.5
+_AS_IF_WRONG, _AS_IF_RIGHT = 1.0, 4.0
+_STEPS = 30
+# One that is told is twice as likely to be wrong as to be right: right ones stand before a wall,
+# where a pose is known best by them.
+_LIKELIER = 2.0
+# A pose that fewer of them bend shows more of them.
+_ROUNDS = 4
 # Those that a pose was found of fit it, most of them, or it says nothing of the others.
 _FITTING = 0.5
 _SINGULAR = 1e-10
@@ -86,6 +99,39 @@ def _like_neighbours(pixels: Array, depth: Array) -> Mask:
 
 def _aside(problem: RelativePoseProblem, like: Mask, start: Pose) -> Mask:
     """Return (M,) which matches miss the pose that some agree on; none where these do not."""
+    out = np.zeros(len(like), dtype=np.bool_)
+    for _ in range(_ROUNDS):
+        missing = _missing(problem, like & ~out, start)
+        if missing is None:
+            break
+        sigmas, start = missing
+        before = out
+        out = sigmas > _STRAY_SIGMAS
+        out[~like] |= sigmas[~like] > _believed_to(sigmas[~like])
+        if (out == before).all():
+            break
+    return out
+
+
+def _believed_to(sigmas: Array) -> float:
+    """Return beyond how many sigmas landmarks are much rather wrong than right.
+
+    A mixture of two normal distributions, by expectation maximization (A. Dempster, N. Laird,
+    D. Rubin, 1977): a standard one of those that are right, a wide one of those that are not.
+    """
+    share, wide = 0.5, _WRONG_SIGMAS
+    for _ in range(_STEPS):
+        odds = np.log((1.0 - share) / share * wide)  # that one which does not miss is right
+        is_wrong = expit(0.5 * sigmas**2 * (1.0 - wide**-2) - odds)
+        n = is_wrong.sum()
+        share = (n + _AS_IF_WRONG) / (len(sigmas) + _AS_IF_WRONG + _AS_IF_RIGHT)
+        wide = max(np.sqrt((is_wrong @ sigmas**2) / max(n, _AS_IF_WRONG)), _WRONG_SIGMAS)
+    odds = np.log(_LIKELIER * (1.0 - share) / share * wide)
+    return float(np.sqrt(2.0 * max(odds, 0.0) / (1.0 - wide**-2)))
+
+
+def _missing(problem: RelativePoseProblem, like: Mask, start: Pose) -> tuple[Array, Pose] | None:
+    """Return (M,) by how many sigmas matches miss the pose that some agree on, and that pose."""
     some = replace(problem, a=problem.a[like], b=problem.b[like])
     missed_px, _ = some.linearized(start)
     noise_px = max(robust_sigma(missed_px), _NOISE_PX)
@@ -95,7 +141,7 @@ def _aside(problem: RelativePoseProblem, like: Mask, start: Pose) -> Mask:
     fits = like & (np.abs(error_px) < _STRAY_SIGMAS * sigma_px)
     covariance = covariance_of(problem.information(agreed, sigma_px, fits), _SINGULAR)
     if covariance is None or fits.sum() < _FITTING * like.sum():
-        return np.zeros(len(like), dtype=np.bool_)
+        return None
     # Far from those that it was found of a pose's lines are known less well.
     variance = sigma_px**2 + np.einsum("ni,ij,nj->n", slopes, covariance, slopes)
-    return np.asarray(error_px**2 > _STRAY_SIGMAS**2 * variance)
+    return np.asarray(np.abs(error_px) / np.sqrt(variance)), agreed
