@@ -16,6 +16,7 @@ import numpy as np
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.mapping.apart import ambiguous
 from vcl_companion.mapping.culling import Mask, depth_errors, fitting, placed
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.growth import Growth, keyframe_of
@@ -140,6 +141,7 @@ class Extension:
             return None
         table = self._with_new(self._start(joined), sorted(joined))
         table, good, _ = self._adjusted(table, 0)
+        table, good = self._less_ambiguous(table, good)
         table = self._measured_again(table, good, sorted(joined))
         table, good, noise_px = self._adjusted(table, 1)
         return self._growth(table, good, noise_px, sorted(joined))
@@ -244,6 +246,18 @@ class Extension:
             good & again,
             noise_px,
         )
+
+    def _less_ambiguous(self, table: Table, good: Mask) -> tuple[Table, Mask]:
+        """Leave out new landmarks that may as well lie where what is beside them does."""
+        rows = np.flatnonzero(good)
+        found_beside = ambiguous(
+            self._table, table.points[rows], table.observed[rows], table.source[rows],
+            self._cameras, self._cams(table), EXACTLY,
+        )  # fmt: skip
+        some = rows[found_beside.any(axis=1)]
+        observed, good = table.observed.copy(), good.copy()
+        observed[some], good[some] = np.nan, False
+        return replace(table, observed=observed), good
 
     def _measured_again(self, table: Table, good: Mask, joined: list[int]) -> Table:
         """Look for patches again from adjusted poses: old ones in new views, new ones in all."""

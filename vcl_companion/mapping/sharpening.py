@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vcl_companion.geometry.camera import Camera
-from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.mapping.apart import ambiguous
 from vcl_companion.mapping.culling import depth_errors, fitting
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions
@@ -21,10 +20,9 @@ from vcl_companion.mapping.patch_table import (
     landmark_noise,
     pyramids_of,
 )
-from vcl_companion.mapping.strays import lonely, strays
+from vcl_companion.mapping.strays import strays
 from vcl_companion.mapping.uncertainty import views_of
 from vcl_companion.mapping.weighing import adjust_weighed
-from vcl_companion.vision.acransac import Mask
 from vcl_companion.vision.bundle import BundleOptions
 from vcl_companion.vision.patches import AlignRules
 
@@ -36,12 +34,6 @@ _ROUNDS = (
 # Residuals of patches that are the same spot.
 _MAX_SIGMAS, _LEAST_LIMIT_PX = 4.0, 0.5
 _CAUCHY_PX = 0.5
-# Where a landmark would be if it were as deep as its neighbours: they differ by such a part, and
-# so by some px; and it is elsewhere if it is farther than that from where it was found.
-_BESIDE, _REACH_PX, _ELSEWHERE_PX = 0.1, 6.0, 3.0
-# Of those that are wrong two in three are found where they should be: where so many of all are, few
-# of the others are right.
-_MOSTLY = 0.6
 SETTLED_CAUCHY_PX = 0.15
 """The same for patches measured from poses that are adjusted already.
 
@@ -104,7 +96,7 @@ def _round(
     points, observed = landmark_map.points_world[kept], found.pixels[best[kept]]
     noise = landmark_noise(found.noise[best[kept]])
     cut_from = view[best[kept]]
-    observed[_ambiguous(table, points, observed, cut_from, cameras, cams, rules)] = np.nan
+    observed[ambiguous(table, points, observed, cut_from, cameras, cams, rules)] = np.nan
     observed[strays(points, observed, cut_from, cameras, cams)] = np.nan
     seen_twice = np.isfinite(observed[:, :, 0]).sum(axis=1) >= 2
     measured = replace(
@@ -113,36 +105,6 @@ def _round(
     if len(measured.points_world) < options.min_landmarks:
         return measured
     return _adjusted(measured, noise[seen_twice], cauchy_px, options)
-
-
-def _ambiguous(
-    table: PatchTable,
-    points: Array,
-    observed: Array,
-    cut_from: NDArray[np.intp],
-    cameras: list[Camera],
-    cams: list[Pose],
-    rules: AlignRules,
-) -> Mask:
-    """Return (N, V) what is found where its neighbours are as well as far before or behind them.
-
-    And the rest that lies far before or behind them, where most of that is so.
-    """
-    rows, beside = lonely(points, observed, cut_from, cameras, cams)
-    out = np.zeros(observed.shape[:2], dtype=np.bool_)
-    if len(rows) == 0:
-        return out
-    view = cut_from[rows]
-    reference = Reference(view, observed[rows, view], beside, np.full(len(rows), _BESIDE))
-    there = table.found(reference, cams, list(range(len(cams))), rules, _REACH_PX).pixels
-    # What is not there, or was not seen, is no farther away than anything.
-    elsewhere = np.linalg.norm(there - observed[rows], axis=2) > _ELSEWHERE_PX
-    elsewhere[np.arange(len(rows)), view] = False
-    if elsewhere.any(axis=1).mean() > _MOSTLY:
-        elsewhere[:] = True
-    out[rows] = elsewhere
-    out[rows, view] = False
-    return out
 
 
 def _adjusted(

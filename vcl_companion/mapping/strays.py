@@ -16,25 +16,17 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.special import expit
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.thinning import cells_of
+from vcl_companion.mapping.apart import N_NEIGHBOURS, like_neighbours
 from vcl_companion.mapping.tracks import ideal_of_pixels
 from vcl_companion.vision.acransac import THRESHOLD_SIGMAS, Mask
 from vcl_companion.vision.information import covariance_of, robust_sigma
 from vcl_companion.vision.relative_pose import RelativePoseProblem, relative_pose_problem
 
-# Of so many neighbours half lie as deep, give or take such a part: on a slanted wall they do, and
-# beside a window taken for the next one they do not; so few of a cell of ``thinning`` count, for
-# most of what is next to a landmark in a window is in the same one.
-_NEIGHBOURS = 30
-_PER_CELL = 3
-_LIKE = 0.3
-_SHARE = 0.5
 # Noise of patches that agree, px, at most: the search of it starts there, or with what they miss
 # the pose by that is there.
 _NOISE_PX = 0.3
@@ -76,13 +68,13 @@ def strays(
     out = np.zeros(seen.shape, dtype=np.bool_)
     for i, k in combinations(range(len(cameras)), 2):
         here = np.flatnonzero(seen[:, i] & seen[:, k] & ((cut_from == i) | (cut_from == k)))
-        if len(here) <= _NEIGHBOURS:
+        if len(here) <= N_NEIGHBOURS:
             continue
         depth = world_from_cams[i].inverse().apply(points[here])[:, 2]
-        like, _ = _like_neighbours(observed_px[here, i], depth, cameras[i])
+        like, _ = like_neighbours(observed_px[here, i], depth, cameras[i])
         moved = world_from_cams[k].inverse() @ world_from_cams[i]
         length = float(np.linalg.norm(moved.translation))
-        if like.sum() <= _NEIGHBOURS or length == 0.0:
+        if like.sum() <= N_NEIGHBOURS or length == 0.0:
             continue
         focal_px = 0.5 * (cameras[i].focal_px + cameras[k].focal_px)
         problem = relative_pose_problem(ideal[here, i], ideal[here, k], focal_px)
@@ -90,55 +82,6 @@ def strays(
         found_in = np.where(cut_from[here] == i, k, i)
         out[here[aside], found_in[aside]] = True
     return out
-
-
-def lonely(
-    points: Array,
-    observed_px: Array,
-    cut_from: NDArray[np.intp],
-    cameras: list[Camera],
-    world_from_cams: list[Pose],
-) -> tuple[NDArray[np.intp], Array]:
-    """Return which landmarks are not as deep as those beside them, and where they would be if so.
-
-    Args:
-        points: (N, 3) landmarks, m.
-        observed_px: (N, V, 2) where their patches were found, NaN where not.
-        cut_from: (N,) the view that each patch is of.
-        cameras: of the V views.
-        world_from_cams: likewise.
-
-    Returns:
-        (M,) rows, and (M, 3) points on the same lines of sight from where they were cut, m.
-    """
-    rows, beside = [], []
-    for i, world_from_cam in enumerate(world_from_cams):
-        seen = np.flatnonzero(np.isfinite(observed_px[:, i, 0]))
-        if len(seen) <= _NEIGHBOURS:
-            continue
-        ahead = world_from_cam.inverse().apply(points[seen])
-        depth = ahead[:, 2]
-        like, usual = _like_neighbours(observed_px[seen, i], depth, cameras[i])
-        here = ~like & (cut_from[seen] == i) & (depth > 0.0)
-        rows.append(seen[here])
-        deep = (usual[here] / depth[here])[:, None]
-        beside.append(world_from_cam.apply(ahead[here] * deep))
-    if not rows:
-        return np.zeros(0, dtype=np.intp), np.zeros((0, 3))
-    return np.concatenate(rows), np.concatenate(beside)
-
-
-def _like_neighbours(pixels: Array, depth: Array, camera: Camera) -> tuple[Mask, Array]:
-    """Return (N,) which landmarks are as deep as half of those beside them, and what is usual."""
-    cells = cells_of(pixels, camera)
-    order = np.argsort(cells, kind="stable")
-    _, first = np.unique(cells[order], return_index=True)
-    place = np.arange(len(order)) - np.repeat(first, np.diff(np.append(first, len(order))))
-    spread = order[place < _PER_CELL]
-    _, near = cKDTree(pixels[spread]).query(pixels, min(_NEIGHBOURS, len(spread)))
-    beside = depth[spread[np.asarray(near).reshape(len(pixels), -1)]]
-    like = np.abs(beside - depth[:, None]) < _LIKE * depth[:, None]
-    return np.asarray(like.mean(axis=1) >= _SHARE), np.asarray(np.median(beside, axis=1))
 
 
 def _aside(problem: RelativePoseProblem, like: Mask, start: Pose) -> Mask:
