@@ -74,7 +74,7 @@ def strays(
         like, _ = like_neighbours(observed_px[here, i], depth, cameras[i])
         moved = world_from_cams[k].inverse() @ world_from_cams[i]
         length = float(np.linalg.norm(moved.translation))
-        if like.sum() <= N_NEIGHBOURS or length == 0.0:
+        if length == 0.0:
             continue
         focal_px = 0.5 * (cameras[i].focal_px + cameras[k].focal_px)
         problem = relative_pose_problem(ideal[here, i], ideal[here, k], focal_px)
@@ -88,7 +88,8 @@ def _aside(problem: RelativePoseProblem, like: Mask, start: Pose) -> Mask:
     """Return (M,) which matches miss the pose that some agree on; none where these do not."""
     out = np.zeros(len(like), dtype=np.bool_)
     for _ in range(_ROUNDS):
-        missing = _missing(problem, like & ~out, start)
+        kept = like & ~out
+        missing = _missing(problem, kept, start) if kept.sum() > N_NEIGHBOURS else None
         if missing is None:
             break
         sigmas, start = missing
