@@ -15,7 +15,7 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.patch_table import PatchTable, Reference
-from vcl_companion.mapping.thinning import cells_of
+from vcl_companion.mapping.thinning import spread
 from vcl_companion.vision.acransac import Mask
 from vcl_companion.vision.patches import AlignRules
 
@@ -36,13 +36,9 @@ _MOSTLY = 0.6
 
 def like_neighbours(pixels: Array, depth: Array, camera: Camera) -> tuple[Mask, Array]:
     """Return (N,) which landmarks are as deep as half of those beside them, and what is usual."""
-    cells = cells_of(pixels, camera)
-    order = np.argsort(cells, kind="stable")
-    _, first = np.unique(cells[order], return_index=True)
-    place = np.arange(len(order)) - np.repeat(first, np.diff(np.append(first, len(order))))
-    spread = order[place < _PER_CELL]
-    _, near = cKDTree(pixels[spread]).query(pixels, min(N_NEIGHBOURS, len(spread)))
-    beside = depth[spread[np.asarray(near).reshape(len(pixels), -1)]]
+    some = spread(pixels[:, None], [camera], _PER_CELL)
+    _, near = cKDTree(pixels[some]).query(pixels, min(N_NEIGHBOURS, len(some)))
+    beside = depth[some[np.asarray(near).reshape(len(pixels), -1)]]
     like = np.abs(beside - depth[:, None]) < _LIKE * depth[:, None]
     return np.asarray(like.mean(axis=1) >= _SHARE), np.asarray(np.median(beside, axis=1))
 
@@ -78,10 +74,7 @@ def ambiguous(
     there = table.found(reference, cams, list(range(len(cams))), rules, _REACH_PX).pixels
     # What is not there, or was not seen, is no farther away than anything.
     elsewhere = np.linalg.norm(there - observed[rows], axis=2) > _ELSEWHERE_PX
-    elsewhere[np.arange(len(rows)), view] = False
-    if elsewhere.any(axis=1).mean() > _MOSTLY:
-        elsewhere[:] = True
-    out[rows] = elsewhere
+    out[rows] = elsewhere | (elsewhere.any(axis=1).mean() > _MOSTLY)
     out[rows, view] = False
     return out
 
