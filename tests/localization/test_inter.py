@@ -17,6 +17,7 @@ from vcl_companion.geometry.rotation import Array, about_down, exp_so3, matrix_f
 from vcl_companion.localization.inter import NoProposal, Proposal, localize_inter
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pair_evidence import InterOptions, Observer
+from vcl_companion.mapping.lens_errors import N_LENS, lens_px
 from vcl_companion.vision.features import Features
 
 HOST = Pose(matrix_from_euler(0.02, -0.03, 0.05), np.array([1.0, 0.8, -0.3]))
@@ -91,6 +92,32 @@ def test_noise_and_wrong_matches_move_it_as_much_as_stated(relief: Scene) -> Non
     values = nees(errors, np.array(covariances))
     assert np.mean(values) < 7.0
     assert np.mean(values) > 0.5
+
+
+def test_the_target_s_lens_is_off_as_much_as_stated(relief: Scene) -> None:
+    exact, descriptors = relief
+    told = replace(exact, uncertainty=replace(exact.uncertainty, calibration_px=4.0))
+    camera = exact.landmark_map.keyframes[0].camera
+    unaware: list[float] = []
+    aware: list[float] = []
+    for seed in range(15):
+        rng = np.random.default_rng(seed)
+        of_host, of_target = (
+            seen_from(rng, exact.landmark_map, descriptors, pose, noise_px=0.5)
+            for pose in (HOST, TARGET)
+        )
+        off_px = lens_px(camera, of_target.pixels, 4.0) @ rng.standard_normal(N_LENS)
+        shifted = replace(of_target, pixels=of_target.pixels + off_px)
+        for index, squared in ((exact, unaware), (told, aware)):
+            scene = index, descriptors
+            found = localize_inter(
+                observer(scene, of_host, HOST), HOST, SURE,
+                observer(scene, shifted, None), index, OPTIONS,
+            )  # fmt: skip
+            assert isinstance(found, Proposal), found
+            squared.append(nees(TARGET.local(found.world_from_body), found.covariance)[0])
+    assert np.median(unaware) > 20.0
+    assert 0.5 < np.median(aware) < 10.0
 
 
 def test_the_host_s_error_reaches_the_target_through_the_lever(

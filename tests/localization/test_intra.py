@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.checks import assert_consistent, assert_pose_close
+from tests.checks import assert_consistent, assert_pose_close, nees
 from tests.localization.maps import Descriptors, flat_map, index_of, index_of_scene, seen_from
 from tests.mapping.views import descriptors_of, map_of
 from tests.scenes import RADIAL_TANGENTIAL, facade_scene, perturbed
@@ -23,6 +23,7 @@ from vcl_companion.localization.intra import (
 )
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.lens_errors import N_LENS, lens_px
 from vcl_companion.vision.features import Features, joined_features
 
 # Between the two keyframes and a little nearer to the facade.
@@ -68,6 +69,25 @@ def rng() -> np.random.Generator:
 @pytest.fixture
 def relief(rng: np.random.Generator) -> tuple[MapIndex, Descriptors]:
     return index_of_scene(rng, facade_scene(rng, 250, relief_m=4.0, n_views=3))
+
+
+def test_a_lens_that_is_off_its_calibration_errs_as_much_as_stated(
+    rng: np.random.Generator, relief: tuple[MapIndex, Descriptors]
+) -> None:
+    exact, descriptors = relief
+    told = replace(exact, uncertainty=replace(exact.uncertainty, calibration_px=3.0))
+    camera = exact.landmark_map.keyframes[0].camera
+    unaware: list[float] = []
+    aware: list[float] = []
+    for _ in range(20):
+        features = seen_from(rng, exact.landmark_map, descriptors, TRUTH, noise_px=0.4)
+        off_px = lens_px(camera, features.pixels, 3.0) @ rng.standard_normal(N_LENS)
+        features = replace(features, pixels=features.pixels + off_px)
+        for index, squared in ((exact, unaware), (told, aware)):
+            fix = located(features, index, options=UNBIASED)
+            squared.append(nees(TRUTH.local(fix.world_from_body), fix.covariance())[0])
+    assert np.mean(unaware) > 20.0
+    assert 3.0 < np.mean(aware) < 10.0
 
 
 @pytest.mark.parametrize("guided", [False, True])

@@ -225,6 +225,47 @@ def test_a_lens_that_is_off_does_not_average_out(
     assert own[1] < 20.0
 
 
+def test_a_lens_that_is_off_its_calibration_errs_as_much_as_stated() -> None:
+    rng = np.random.default_rng(12)
+    exact = prepared(painted_map(rng, n=300))
+    told = replace(exact, uncertainty=replace(exact.uncertainty, calibration_px=1.0))
+    half = PINHOLE.width_px / 2.0
+    unaware: list[float] = []
+    aware: list[float] = []
+    for _ in range(8):
+        fx, fy, cx, cy = 0.5 * rng.standard_normal(4)
+        off = replace(
+            PINHOLE,
+            fx_px=PINHOLE.fx_px * (1.0 + fx / half),
+            fy_px=PINHOLE.fy_px * (1.0 + fy / half),
+            cx_px=PINHOLE.cx_px + cx,
+            cy_px=PINHOLE.cy_px + cy,
+        )
+        truth = perturbed(rng, TRUTH, 0.8, 0.05)
+        image, prior = photograph(truth, rng), near(rng, truth)
+        for templates, squared in ((exact, unaware), (told, aware)):
+            fix = tracked(image, templates, prior, off)
+            squared.append(nees(truth.local(fix.world_from_body), fix.covariance())[0])
+    assert np.median(unaware) > 30.0
+    assert 0.3 < np.median(aware) < 10.0
+
+
+def test_where_its_own_keyframe_saw_it_a_lens_is_off_no_more_than_there(
+    rng: np.random.Generator, templates: Templates
+) -> None:
+    told = replace(templates, uncertainty=replace(templates.uncertainty, calibration_px=1.0))
+    image, prior = photograph(BODIES[0], rng), near(rng, BODIES[0])
+    more = []
+    for drone_id in (1, 2):
+        covariances = [
+            tracked(image, one, prior, drone_id=drone_id).own_map_covariance
+            for one in (templates, told)
+        ]
+        more.append(np.sqrt(np.trace((covariances[1] - covariances[0])[3:, 3:])))
+    assert more[1] * PINHOLE.focal_px > 0.3
+    assert more[0] < 0.5 * more[1]
+
+
 def test_no_position_is_told_better_than_a_camera_s_place_on_its_drone(
     rng: np.random.Generator, templates: Templates
 ) -> None:

@@ -470,6 +470,8 @@ def test_drones_in_the_same_place_are_refused() -> None:
     ("changes", "reason"),
     [
         ({"keyframe_quality": 0}, "keyframe_quality"),
+        ({"calibration_px": -0.1}, "calibration_px"),
+        ({"calibration_px": float("nan")}, "calibration_px"),
         ({"update_quality": 101}, "update_quality"),
         ({"min_landmarks": 10}, "min_landmarks"),
         ({"min_angle_deg": 0.0}, "min_angle_deg"),

@@ -16,6 +16,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping import misplacement
 from vcl_companion.mapping.landmark_map import KnownDistance, LandmarkMap
+from vcl_companion.mapping.lens_errors import lenses_px, n_lens_causes
 from vcl_companion.mapping.misplacement import (
     ASIDE_DEG,
     ASIDE_NOISE_PX,
@@ -167,6 +168,33 @@ def test_keyframes_err_as_much_as_stated_where_observations_err_alike(
     monkeypatch.setattr(misplacement, "SMOOTH_PX", 0.0)
     alone = map_uncertainty(truth).keyframe_covariance[6:, 6:]
     assert float(nees(errors, alone).mean()) > 1.5 * float(nees(errors, sigmas).mean())
+
+
+def test_keyframes_err_as_much_as_stated_where_lenses_are_off() -> None:
+    """Two drones' lenses, each off by something of its own in both of its keyframes."""
+    rng = np.random.default_rng(6)
+    made = map_of(facade_scene(rng, 800, relief_m=4.0, n_views=4), noise_px=0.05)
+    keyframes = tuple(replace(k, drone_id=1 + i % 2) for i, k in enumerate(made.keyframes))
+    truth = replace(made, keyframes=keyframes)
+    assert n_lens_causes(truth) == 14
+    by_lenses = np.full((*truth.observed_px.shape, 14), np.nan)
+    for i, field in enumerate(lenses_px(truth, 0.3)):
+        by_lenses[truth.seen[:, i], i] = field
+    fields = fields_of(truth)
+    errors, sigmas = [], []
+    for _ in range(60):
+        alike = fields @ rng.standard_normal(N_FIELDS) + by_lenses @ rng.standard_normal(14)
+        own = noise_px(truth)[..., None] * rng.standard_normal(truth.observed_px.shape)
+        found = adjusted(replace(truth, observed_px=truth.observed_px + alike + own))
+        moved = [
+            t.world_from_body.local(k.world_from_body)
+            for t, k in zip(truth.keyframes[1:], found.keyframes[1:], strict=True)
+        ]
+        errors.append(np.concatenate(moved))
+        sigmas.append(map_uncertainty(found, 0.3).keyframe_covariance[6:, 6:])
+    assert_consistent(errors, sigmas)
+    exact = map_uncertainty(truth).keyframe_covariance[6:, 6:]
+    assert float(nees(errors, exact).mean()) > 3.0 * float(nees(errors, sigmas).mean())
 
 
 def test_a_camera_that_stays_where_it_is_errs_in_nothing_more() -> None:

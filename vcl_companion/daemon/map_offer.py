@@ -12,7 +12,7 @@ from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.mapping.agreement import contradiction, have_common_keyframes, moved_to
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.templates import Templates, prepare_templates
-from vcl_companion.mapping.uncertainty import MapUncertainty
+from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
 from vcl_companion.vision.features import Detector, FeatureOptions, Features
 from vcl_companion.wire.header import BlobKind
 from vcl_companion.wire.map_codec import decode_map, parent_of, revision_of
@@ -107,6 +107,7 @@ def ready_map(
     tracked: bool,
     held: Mapping[bytes, bytes],
     decode: Callable[[bytes], LandmarkMap] = decode_map,
+    calibration_px: float = 0.0,
 ) -> ReadyMap:
     """Decode, index and cut patches; takes a second, beside the event loop and the frames.
 
@@ -121,6 +122,7 @@ def ready_map(
         tracked: whether the map is also made ready to be tracked.
         held: images that were sent ahead, by their names.
         decode: ``decode_map``, or what remembers what that has returned.
+        calibration_px: what lenses may be off; see ``map_uncertainty``.
 
     Raises:
         WireError: the bytes are no map, or need a parent that is not in use here, or
@@ -147,7 +149,8 @@ def ready_map(
         else:
             update = encode_map_update(data, current.index.landmark_map, whole)
 
-    index = shared(_indexed(whole, detector, features, memory))
+    sure = map_uncertainty(whole, calibration_px)
+    index = shared(_indexed(whole, detector, features, memory, sure))
     templates = None
     if tracked:
         templates = shared(prepare_templates(index.landmark_map, index.uncertainty, memory.pyramid))
@@ -198,7 +201,7 @@ def _indexed(
     detector: Detector,
     features: FeatureOptions,
     memory: FeatureMemory,
-    uncertainty: MapUncertainty | None = None,
+    uncertainty: MapUncertainty,
 ) -> MapIndex:
     def features_of(keyframe: Keyframe) -> Features:
         return memory.features(keyframe.image_bytes, keyframe.camera, detector)

@@ -239,7 +239,7 @@ class Workshop:
         self.keep_only(current)
         ready = ready_map(
             offer, stored, options.detectors[0], options.pipeline.features, self._memory,
-            options.tracked, held, self._decoded,
+            options.tracked, held, self._decoded, options.map.calibration_px,
         )  # fmt: skip
         self.learn(ready.stored())
         give_back_freed()  # making it took a hundred megabytes more than it is

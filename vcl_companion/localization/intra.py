@@ -13,6 +13,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, euler_from_matrix
 from vcl_companion.localization.coverage import covered_share
 from vcl_companion.localization.map_index import MapIndex
+from vcl_companion.mapping.lens_errors import lens_px
 from vcl_companion.vision.features import Detector, Features
 from vcl_companion.vision.matching import MatchOptions, match_guided, match_to_entries
 from vcl_companion.vision.resection import (
@@ -343,7 +344,9 @@ class _Matcher:
         return Localized(
             result.world_from_body,
             result.noise_covariance,
-            *self._map_error(result, attempt.landmarks[result.inliers]),
+            *self._map_error(
+                result, attempt.landmarks[result.inliers], attempt.pixels[result.inliers]
+            ),
             self.index.uncertainty.keyframe_covariance,
             n_matched,
             n_inliers,
@@ -353,7 +356,9 @@ class _Matcher:
             covered_share(attempt.pixels[result.inliers], self.camera),
         )
 
-    def _map_error(self, result: Resection, landmarks: NDArray[np.intp]) -> tuple[Array, Array]:
+    def _map_error(
+        self, result: Resection, landmarks: NDArray[np.intp], pixels: Array
+    ) -> tuple[Array, Array]:
         """Return the pose's (6, 6) covariance by the landmarks' own errors, and its map lever."""
         uncertainty = self.index.uncertainty
         by_landmark = -result.gain @ result.jacobian_points
@@ -362,6 +367,10 @@ class _Matcher:
         )
         lever = np.einsum("mij,mjk->ik", by_landmark, uncertainty.landmark_lever[landmarks])
         own += result.bias_covariance
+        if uncertainty.calibration_px:
+            off_px = lens_px(self.camera, pixels, uncertainty.calibration_px)
+            by_lens = np.einsum("mij,mjk->ik", result.gain, off_px)
+            own += by_lens @ by_lens.T
         return np.asarray(0.5 * (own + own.T)), np.asarray(lever)
 
     def _sightings(

@@ -17,6 +17,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, about_down, heading_of, log_so3, skew
 from vcl_companion.localization.jackknife import jackknife, no_less_than
 from vcl_companion.localization.map_index import MapIndex
+from vcl_companion.mapping.lens_errors import lens_px
 from vcl_companion.vision.bundle import linearized
 from vcl_companion.vision.epipolar import signed_sampson
 from vcl_companion.vision.features import Features
@@ -190,8 +191,10 @@ class PairEvidence:
         through = -inverse @ self._by_host(pose, chosen)
         shared = -inverse @ self._by_keyframes(pose, chosen)
         keyframes = self.index.uncertainty.keyframe_covariance
+        by_lens = -inverse @ self._by_lens(pose, chosen)
         of_matches = no_less_than(
-            inverse + shared @ keyframes @ shared.T, self._jackknife(pose, chosen)
+            inverse + shared @ keyframes @ shared.T + by_lens @ by_lens.T,
+            self._jackknife(pose, chosen),
         )
         return np.asarray(of_matches + through @ host_covariance @ through.T)
 
@@ -256,6 +259,14 @@ class PairEvidence:
         levers = self.index.uncertainty.landmark_lever[self.landmarks[chosen.landmark]]
         by_point = weighted @ j_point
         return np.asarray(np.tensordot(by_point, levers, axes=((0, 2), (0, 1))))
+
+    def _by_lens(self, pose: Pose, chosen: Agreement) -> Array:
+        """Return (6, 7) how the right side goes with the target's lens, by its landmarks."""
+        camera, of_landmarks = self.target.camera, chosen.landmark
+        weighted, _, _, _ = self._places(pose, of_landmarks, self._sigma_px(pose))
+        pixels = camera.pixels_from_ideal(self.ideal_target[of_landmarks])
+        off_px = lens_px(camera, pixels, self.index.uncertainty.calibration_px)
+        return np.asarray(np.tensordot(weighted, off_px, axes=((0, 2), (0, 1))))
 
     def _lines(
         self, pose: Pose, chosen: NDArray[np.bool_], sigma_px: Array

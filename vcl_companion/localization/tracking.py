@@ -19,6 +19,7 @@ from vcl_companion.localization.intra import (
     believed,
 )
 from vcl_companion.localization.patch_pose import PatchPoses
+from vcl_companion.mapping.lens_errors import lens_px
 from vcl_companion.mapping.novelty import novelty_deg
 from vcl_companion.mapping.templates import Templates
 from vcl_companion.vision.features import Image
@@ -308,6 +309,7 @@ class _Tracker:
             _ROBUST_LOSS * by_misplacement
             + by_landmarks
             + self._by_shift(found.of(agrees))
+            + self._by_lens(found, inverse, j_poses, roots, weights)
             + np.diag([self._options.mounted_m**2] * 3 + [0.0] * 3),
             lever,
             uncertainty.keyframe_covariance,
@@ -327,12 +329,37 @@ class _Tracker:
         """Return the pose's (6, 6) covariance by a shift of the whole image: the camera, turned."""
         moved_px = np.linalg.norm(found.pixels - self._anchors.pixels[found.anchors], axis=1)
         # Another drone's lens is another one.
-        took = self._templates.drone_ids[self._anchors.keyframe[found.anchors]]
-        moved_px[took != (-1 if self._drone_id is None else self._drone_id)] = np.inf
+        moved_px[~self._is_ours(found)] = np.inf
         share = min(float(np.median(moved_px)) / _SHIFTED_WHOLLY_PX, 1.0)
         turned = adjoint(self._mounting)[:, 3:5]
         shifted_rad = share * self._options.shifted_px / self._camera.focal_px
         return np.asarray(shifted_rad**2 * turned @ turned.T)
+
+    def _by_lens(
+        self, found: Alignment, inverse: Array, j_poses: Array, roots: Array, weights: Array
+    ) -> Array:
+        """Return the pose's (6, 6) covariance by what the lens may be off.
+
+        Of landmarks that the same drone's keyframes fixed it is off alike there: what counts is
+        the difference.
+        """
+        calibration_px = self._templates.uncertainty.calibration_px
+        if not calibration_px:
+            return np.zeros((6, 6))
+        off_px = lens_px(self._camera, found.pixels, calibration_px)
+        own = self._is_ours(found)
+        then = self._anchors.pixels[found.anchors[own]]
+        off_px[own] -= lens_px(self._camera, then, calibration_px)
+        # In units of the residuals' sigmas, as ``j_poses``.
+        first = off_px[:, 0] / roots[0][:, None]
+        second = (off_px[:, 1] - roots[1][:, None] * first) / roots[2][:, None]
+        moved = inverse @ ((j_poses[0] * weights) @ first + (j_poses[1] * weights) @ second)
+        return np.asarray(moved @ moved.T)
+
+    def _is_ours(self, found: Alignment) -> NDArray[np.bool_]:
+        """Return (M,) whether patches are of keyframes that this drone's own camera took."""
+        took = self._templates.drone_ids[self._anchors.keyframe[found.anchors]]
+        return np.asarray(took == (-1 if self._drone_id is None else self._drone_id))
 
     def _novelty_deg(self, anchors: NDArray[np.int64], pose: Pose) -> float:
         centres = self._anchors.images.centres

@@ -85,7 +85,9 @@ def pruned(landmark_map: LandmarkMap, n_old: int, options: MapOptions) -> Landma
         del left[k]
         n_old -= 1
     if left[0] != 0 or (whole.distances and not landmark_map.distances):
-        landmark_map = _anchored_anew(landmark_map, whole, map_uncertainty(whole), left)
+        landmark_map = _anchored_anew(
+            landmark_map, whole, map_uncertainty(whole, options.calibration_px), left
+        )
     excess = len(landmark_map.points_world) - options.max_landmarks
     if excess > 0:
         # The longest tracks stay; of equal ones the older.

@@ -86,7 +86,8 @@ def merged(
         return NoMap(reason)
     one_world = senior.world_of(senior_revision) == junior.world_of(junior_revision)
     try:
-        one, other = Side(senior, sure or map_uncertainty(senior)), _side(junior)
+        one = Side(senior, sure or map_uncertainty(senior, options.calibration_px))
+        other = _side(junior, options)
         stands = _aligned(one, other, features_of, options, seed, one_world=one_world)
         if isinstance(stands, NoMap):
             return stands
@@ -172,9 +173,9 @@ def _needless(
     return ""
 
 
-def _side(junior: LandmarkMap) -> Side:
+def _side(junior: LandmarkMap, options: MapOptions) -> Side:
     try:
-        return Side(junior, map_uncertainty(junior))
+        return Side(junior, map_uncertainty(junior, options.calibration_px))
     except ValueError as error:
         raise ValueError(f"the other map: {error}") from None
 

@@ -23,6 +23,8 @@ class MapOptions:
         update_quality: of those that extend a map: what they are for is found by its patches.
         update_features: images that extend a map keep their detail around so many of their
             strongest features and are blurred elsewhere (``vision.focus``).
+        calibration_px: what each drone's lens may be off its calibration at the image's border,
+            1 sigma: considered in all covariances; 0 for lenses that are exact.
         min_landmarks: fewer are refused.
         min_angle_deg: landmarks seen under a smaller angle are left out.
         max_error_px: observations that miss by more are left out.
@@ -44,6 +46,7 @@ class MapOptions:
     keyframe_quality: int = 60
     update_quality: int = 40
     update_features: int = 1000
+    calibration_px: float = 0.0
     min_landmarks: int = 60
     min_angle_deg: float = 1.0
     max_error_px: float = 2.5
@@ -71,6 +74,8 @@ class MapOptions:
                 raise ValueError(f"{name} must lie in 1..100, got {getattr(self, name)}")
         if not 100 <= self.update_features <= 20_000:
             raise ValueError(f"update_features must lie in 100..20000, got {self.update_features}")
+        if not 0.0 <= self.calibration_px <= 10.0:
+            raise ValueError(f"calibration_px must lie in 0..10, got {self.calibration_px}")
         if self.min_landmarks < 20:
             raise ValueError(f"min_landmarks must be at least 20, got {self.min_landmarks}")
         if self.landmarks_per_cell < 1:

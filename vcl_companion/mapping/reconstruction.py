@@ -96,7 +96,7 @@ def accepted(landmark_map: LandmarkMap, options: MapOptions) -> LandmarkMap | No
     if n < options.min_landmarks:
         return NoMap(f"{n} landmarks could be placed, {options.min_landmarks} needed")
     try:
-        covariance = map_uncertainty(landmark_map).marginal()
+        covariance = map_uncertainty(landmark_map, options.calibration_px).marginal()
     except ValueError as error:
         return NoMap(str(error))
     sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2))

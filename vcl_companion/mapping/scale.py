@@ -58,16 +58,18 @@ def metric(
     known.sort(key=lambda d: -d.distance_m)
     if len(known) > 1:
         # The longest knows the scale best: what it says of the others they have to bear out.
-        reason = _contradiction(_scaled_map(drones, scene, observed, known[:1], options), known)
+        reason = _contradiction(
+            _scaled_map(drones, scene, observed, known[:1], options), known, options
+        )
         if reason:
             return NoMap(reason)
     return _scaled_map(drones, scene, observed, known, options)
 
 
-def _contradiction(landmark_map: LandmarkMap, known: list[Distance]) -> str:
+def _contradiction(landmark_map: LandmarkMap, known: list[Distance], options: MapOptions) -> str:
     """Say which known distance a map made by the first of them contradicts; empty for none."""
     try:
-        covariance = map_uncertainty(landmark_map).keyframe_covariance
+        covariance = map_uncertainty(landmark_map, options.calibration_px).keyframe_covariance
     except ValueError as error:
         return str(error)
     keyframes = landmark_map.keyframes

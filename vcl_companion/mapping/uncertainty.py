@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from vcl_companion.geometry.pose import adjoint
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.lens_errors import lenses_px, n_lens_causes
 from vcl_companion.mapping.misplacement import N_FIELDS, noise_px, smooth_px
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.vision.bundle import Distance, Views, normal_equations
@@ -46,11 +47,13 @@ class MapUncertainty:
         keyframe_covariance: (6V, 6V) of the keyframe bodies, local perturbations.
         landmark_covariance: (N, 3, 3) of each landmark were the keyframes exact, m^2.
         landmark_lever: (N, 3, 6V) landmark error per keyframe error.
+        calibration_px: what lenses were taken to be off (``lens_errors``); 0 for exact ones.
     """
 
     keyframe_covariance: Array
     landmark_covariance: Array
     landmark_lever: NDArray[np.float32]
+    calibration_px: float = 0.0
 
     def marginal(self) -> Array:
         """Return (N, 3, 3) the whole covariance of each landmark, m^2."""
@@ -94,8 +97,12 @@ def views_of(landmark_map: LandmarkMap) -> Views:
     )
 
 
-def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
+def map_uncertainty(landmark_map: LandmarkMap, calibration_px: float = 0.0) -> MapUncertainty:
     """Compute the joint covariance of keyframes and landmarks.
+
+    Args:
+        landmark_map: any revision.
+        calibration_px: what every drone's lens may be off (``lens_errors``), 1 sigma.
 
     Raises:
         ValueError: the map's observations do not fix it (no known distance, a
@@ -111,7 +118,8 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
     # map of many keyframes, and a millionth of it is no matter.
     lever = np.empty((n, 3, 6 * n_keyframes), dtype=np.float32)
     reduced = np.zeros((6 * n_keyframes, 6 * n_keyframes))
-    pulls = np.zeros((6 * n_keyframes, N_FIELDS))
+    n_causes = N_FIELDS + (n_lens_causes(landmark_map) if calibration_px else 0)
+    pulls = np.zeros((6 * n_keyframes, n_causes))
     with np.errstate(all="ignore"):
         # Distances enter in units of their own sigma; pixels in px: bring both to sigmas.
         for some in _portions(n):
@@ -122,9 +130,9 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
             sees = part.seen
             alike = (
                 errors_px / noise[sees[:, i], i, None, None]
-                for i, errors_px in enumerate(smooth_px(part))
+                for i, errors_px in enumerate(_common_px(part, calibration_px))
             )
-            system = normal_equations(scaled, None, alike, N_FIELDS)
+            system = normal_equations(scaled, None, alike, n_causes)
             inverse[some] = _inverse(system.point_block)
             lever[some] = -np.swapaxes(system.cross @ inverse[some], 1, 2)
             reduced += system.pose_block - eliminated(system.cross, inverse[some], system.seen)
@@ -143,7 +151,17 @@ def map_uncertainty(landmark_map: LandmarkMap) -> MapUncertainty:
             covariance += as_first @ landmark_map.anchor_covariance @ as_first.T
     if not np.all(np.isfinite(covariance)):
         raise ValueError("the map's observations do not fix it")
-    return MapUncertainty(covariance, inverse, lever)
+    return MapUncertainty(covariance, inverse, lever, calibration_px)
+
+
+def _common_px(landmark_map: LandmarkMap, calibration_px: float) -> Iterator[Array]:
+    """Yield of each view by how much it errs in common, by its patches and by its lens."""
+    if not calibration_px:
+        yield from smooth_px(landmark_map)
+        return
+    both = zip(smooth_px(landmark_map), lenses_px(landmark_map, calibration_px), strict=True)
+    for of_patches, of_lenses in both:
+        yield np.concatenate([of_patches, of_lenses], axis=2)
 
 
 def _of(landmark_map: LandmarkMap, some: slice) -> LandmarkMap:

@@ -94,7 +94,7 @@ def extended(
     if not views:
         return NoMap("there is no view that the map does not have already")
     try:
-        sure = sure or map_uncertainty(old)
+        sure = sure or map_uncertainty(old, options.calibration_px)
         growth = _grown(
             old, sure, views, features_of, options, seed, pyramid_of, MutualMatches(), at_once
         )
@@ -145,7 +145,14 @@ def _grown(
         return growth
     known = growth.landmark_map
     late = _by_features(
-        known, map_uncertainty(known), waiting, features_of, options, seed, pyramid_of, matches
+        known,
+        map_uncertainty(known, options.calibration_px),
+        waiting,
+        features_of,
+        options,
+        seed,
+        pyramid_of,
+        matches,
     )
     if isinstance(late, NoMap):
         return growth
@@ -258,7 +265,7 @@ class _Update:
             if growth is not None:
                 known = growth.landmark_map
                 try:
-                    sure = map_uncertainty(known)
+                    sure = map_uncertainty(known, self._options.calibration_px)
                 except ValueError as error:
                     return NoMap(str(error))
             if growth is not None and self._join_new(growth, known, sure):
