@@ -6,8 +6,9 @@ import asyncio
 import contextlib
 import json
 import threading
+import weakref
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -20,30 +21,36 @@ from sitl.frame_server import FrameServer
 from tests.daemon import demo
 from tests.daemon.autopilot import Autopilot, autopilot_and_link
 from tests.daemon.waiting import beside, hurry, run, until
+from vcl_companion.cameras.source import Frame
 from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import ManualClock
-from vcl_companion.daemon.companion import Companion
+from vcl_companion.daemon.companion import Companion, _AskedPeers
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
-from vcl_companion.daemon.inter_target import InterTarget
+from vcl_companion.daemon.inter_target import Asked, InterTarget
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.teller import Teller
 from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.geometry.rotation import matrix_from_euler, quaternion_from_matrix
+from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.localization.intra import LocalizationOptions, Localized, NotLocalized
+from vcl_companion.localization.map_index import index_map
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.localization.tracking import TrackingOptions
+from vcl_companion.mapping.agreement import moved_to
+from vcl_companion.mapping.templates import prepare_templates
 from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
-from vcl_companion.wire.map_codec import revision_of
+from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
 from vcl_companion.wire.messages import MapState
+from vcl_companion.wire.pose_messages import PoseProposal
 
 DRONE = 2
 FRAMES_ALONE = AutopilotOptions(min_rate_hz=0.0)
@@ -298,6 +305,90 @@ def test_a_refused_map_answers_the_frame_with_its_reason(tmp_path: Path) -> None
             up.fly_on_a_map()
             await up.server.answered()
             assert up.server.outcomes == {0: "refused", 1: "localized"}
+
+    run(scenario())
+
+
+def in_another_world() -> Callable[[Flight], None]:
+    """Return what joins a flight's world with one whose origin is 20 m away."""
+    other_from_ours = Similarity(np.eye(3), np.array([20.0, -8.0, 0.0]))
+    moved = moved_to(decode_map(demo.encoded_map(1, 2, 3)), other_from_ours)
+    index = index_map(moved, "akaze", demo.FEATURES)
+    patches = prepare_templates(moved, index.uncertainty)
+
+    def join(up: Flight) -> None:
+        up.estimator.carry(other_from_ours)
+        up.maps.replace(encode_map(moved), index, templates=patches)
+
+    return join
+
+
+def test_what_was_looked_at_in_a_world_that_was_left_is_looked_at_again(tmp_path: Path) -> None:
+    join = in_another_world()
+
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            executor = up.companion._executor
+            assert isinstance(executor, ThreadPoolExecutor)
+            looks = threading.Barrier(2)
+            for k in range(6):
+                if k == 3:
+                    executor.submit(looks.wait, 20.0)
+                    await until(lambda: looks.n_waiting == 1)
+                up.give(k)
+                if k == 3:
+                    await until(lambda: executor._work_queue.qsize() == 1)
+                    join(up)
+                    looks.wait(20.0)
+                await up.server.answered()
+                pose = await up.autopilot.poses.get()
+                truth = demo.world_from_body(DRONE, k).translation
+                assert np.linalg.norm(np.array(pose[1:4]) - truth) < 0.1
+            assert [outcome for _, outcome, _ in up.frames()] == ["localized"] * 6
+
+    run(scenario())
+
+
+def test_what_was_searched_in_a_world_that_was_left_is_searched_again(tmp_path: Path) -> None:
+    join = in_another_world()
+
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            up.estimator._history.clear()
+            up.shop.is_open.clear()
+            up.give(0)
+            await until(lambda: up.companion._map_search.is_under_way)
+            join(up)
+            up.shop.is_open.set()
+            await up.server.answered()
+            state = up.estimator.own_fix_at(demo.shot(DRONE, 0).at_ns)
+            assert state is not None
+            there = demo.world_from_body(DRONE, 0).translation + np.array([20.0, -8.0, 0.0])
+            assert np.linalg.norm(state.world_from_body.translation - there) < 0.1
+
+    run(scenario())
+
+
+def test_what_peers_say_of_a_world_that_was_left_is_not_believed(tmp_path: Path) -> None:
+    join = in_another_world()
+
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            stored = up.maps.current
+            assert stored is not None
+            shot = demo.shot(DRONE, 0)
+            frame = Frame(shot.image, shot.at_ns, 0, 0)
+            revision = stored.revision
+            asked = Asked(1, frame, shot.ned_from_body.rotation, revision, np.inf, {1}, [])
+            before = _AskedPeers(asked, weakref.ref(stored), stored.world, np.zeros((1, 3)), None)
+            there = demo.world_from_body(DRONE, 0)
+            said = PoseProposal.of(1, revision, there, 1e-4 * np.eye(6))
+            join(up)
+            assert up.companion._fuse(1, said, before) is None
+            assert up.estimator.sigma_m == np.inf
 
     run(scenario())
 

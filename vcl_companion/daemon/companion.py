@@ -51,12 +51,14 @@ class _AskedPeers:
         asked: the request.
         stored: the map that was flown on. Its answers come seconds later: by then it may have
             been left, and is not to be kept in memory for them.
+        world: that it is of.
         points_world: (N, 3) landmarks of it, m.
         refused: why the frame itself gave no pose; None where it did.
     """
 
     asked: Asked
     stored: weakref.ref[StoredMap]
+    world: bytes
     points_world: Array
     refused: NotLocalized | None
 
@@ -177,6 +179,8 @@ class Companion:
         may_doubt = now_s >= self._doubted_at_s + _DOUBT_EVERY_S
         effort = Effort(may_search=not follows, may_doubt=may_doubt)
         fix = await self._looked_at(frame, stored, ned_from_body, effort)
+        if self._maps.has_left_world(stored.world):
+            return await self._localize(frame, self._maps.current or stored)
         if isinstance(fix, Localized) and is_doubtful(fix):
             self._doubted_at_s = now_s
         refused = self._take(frame, fix, ned_from_body)
@@ -246,6 +250,8 @@ class Companion:
             return False
         ned_from_body = await self._attitude_of(frame)
         fix = await self._looked_at(frame, stored, ned_from_body, _PATCHES_ALONE)
+        if self._maps.has_left_world(stored.world):
+            return False
         if isinstance(fix, NotLocalized) or self._take(frame, fix, ned_from_body) is not None:
             return False
         self._outcomes.close(frame)
@@ -271,7 +277,7 @@ class Companion:
             asked = self._inter.begin(frame, ned_from_body, stored.revision, sigma_m)
         if asked is not None:
             points_world = stored.index.landmark_map.points_world
-            return _AskedPeers(asked, weakref.ref(stored), points_world, refused)
+            return _AskedPeers(asked, weakref.ref(stored), stored.world, points_world, refused)
         if refused is None:
             self._outcomes.close(frame)
             return None
@@ -355,9 +361,11 @@ class Companion:
         """Fuse a proposal at its frame's own time; return the state of that instant if taken."""
         at_ns = open_frame.asked.frame.captured_at_ns
         pose, covariance = proposal.world_from_body, proposal.covariance
-        state = self._estimator.take_proposal(
-            at_ns, open_frame.asked.ned_from_body, pose, covariance, open_frame.points_world
-        )
+        state: FilterState | NotFused = NotFused("of a world that was left since")
+        if not self._maps.has_left_world(open_frame.world):
+            state = self._estimator.take_proposal(
+                at_ns, open_frame.asked.ned_from_body, pose, covariance, open_frame.points_world
+            )
         why = state.reason if isinstance(state, NotFused) else ""
         # Without a fix of our own one peer may only be said to contradict another.
         tells = not isinstance(state, NotFused) or state.contradicts

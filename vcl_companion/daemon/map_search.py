@@ -109,7 +109,8 @@ class MapSearch:
     async def found(self, sought: Sought) -> tuple[StoredMap, Localized | NotLocalized]:
         """Return what the features of a frame say, and of which map: of a newer one if that came.
 
-        A map that was made because the last one ended here comes while that is searched in vain.
+        A map that was made because the last one ended here comes while that is searched in vain;
+        one of another world, however the search ends.
         """
         frame, stored = sought.frame, sought.stored
         effort = Effort(
@@ -124,11 +125,12 @@ class MapSearch:
             fix = await self._work.find(
                 np.asarray(frame.image), stored, prior, sought.ned_from_body, effort
             )
-            if isinstance(fix, Localized):
-                return stored, fix
-            self._searched_in_vain(frame, stored, began_s)
-            if sought.may_fall_back and stored.index.fallback is not None:
-                self._fell_back_at_s = began_s
+            if not self._maps.has_left_world(stored.world):
+                if isinstance(fix, Localized):
+                    return stored, fix
+                self._searched_in_vain(frame, stored, began_s)
+                if sought.may_fall_back and stored.index.fallback is not None:
+                    self._fell_back_at_s = began_s
             if self._maps.current is None or self._maps.current is stored:
                 return stored, fix
             stored = self._maps.current

@@ -122,6 +122,10 @@ class MapStore:
         self._decided.set()
         return stored
 
+    def has_left_world(self, world: bytes) -> bool:
+        """Whether the map in use is of another world: what was found in this one says nothing."""
+        return self.current is not None and self.current.world != world
+
     def improve(self, stored: StoredMap, index: MapIndex) -> None:
         """Recognise a revision by a better index from the next frame on, if it is still in use."""
         if self.current is stored:
