@@ -121,3 +121,22 @@ def test_shares_between_two_frames_add_up_to_less_than_one_at_any_rate(rate_hz: 
         pacer.told_between(slot.at_ns)
     assert len(shares) == round(rate_hz / 5.0) - 1
     assert sum(shares) == pytest.approx(1.0 - 5.0 / rate_hz)
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 10.0, 15.0, 20.0, 30.0])
+def test_frames_that_come_later_than_before_are_told_again_after_a_few(rate_hz: float) -> None:
+    """What lies between overtakes the first of them, and has to wait for the others."""
+    pacer = Pacer(10.0, 30.0)
+    held_back = 0
+    for k in range(round(20.0 * rate_hz)):
+        at_ns = START_NS + round(k / rate_hz * 1e9)
+        comes_ns = at_ns + (30 if k < 5.0 * rate_hz else 200) * MS
+        while (slot := pacer.next_between(comes_ns)) is not None and slot.due_ns < comes_ns:
+            pacer.told_between(slot.at_ns)
+        pacer.arrived(at_ns)
+        if pacer.holds_back(at_ns):
+            pacer.held_back(comes_ns - at_ns)
+            held_back += 1
+        else:
+            pacer.told(at_ns, comes_ns - at_ns)
+    assert held_back <= 20

@@ -239,6 +239,16 @@ def test_nothing_is_told_of_after_a_frame_that_is_still_looked_at(tmp_path: Path
     run(scenario())
 
 
+def test_frames_that_nobody_looks_at_are_not_remembered_for_ever(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            for k in range(1000):
+                up.teller.arrived(START_NS + k * 33 * MS)
+            assert len(up.teller._unseen) < 20
+
+    run(scenario())
+
+
 def test_a_pose_older_than_one_that_was_told_is_held_back(tmp_path: Path) -> None:
     async def scenario() -> None:
         async with flying(tmp_path) as up:

@@ -78,6 +78,14 @@ class Pacer:
         self._lags.append(max(lag_ns, 0))
         self._told_ns = self._frame_told_ns = at_ns
 
+    def held_back(self, lag_ns: int) -> None:
+        """Note that a frame's pose was not told, so long after the frame's instant.
+
+        Those between have to wait for it as well: once all frames came later than before, and none
+        would be told any more.
+        """
+        self._lags.append(max(lag_ns, 0))
+
     def told_between(self, at_ns: int) -> None:
         """Note that a pose between frames was told."""
         self._told_ns = at_ns

@@ -30,6 +30,9 @@ from vcl_companion.localization.pose_filter import FilterState
 
 _log = logging.getLogger(__name__)
 
+# While there is no map no frame is looked at, and none after another: only the last few hold poses
+# up. No more than these are on their way at a time.
+_MOST_UNSEEN = 15
 # After so long without a pose nobody knows from it where the autopilot takes us to be.
 _SILENT_NS = 1_000_000_000
 # Of the information of one pose, in all those between two frames.
@@ -101,7 +104,7 @@ class Teller:
     def arrived(self, at_ns: int) -> None:
         """Note a frame that has come: nothing later is told until it is looked at."""
         self._pacer.arrived(at_ns)
-        self._unseen = [*self._still_unseen(), at_ns]
+        self._unseen = [*self._still_unseen()[-_MOST_UNSEEN:], at_ns]
 
     def tell(self, state: FilterState, at_ns: int) -> Untold | None:
         """Tell a frame's pose at its own instant, or say why not.
@@ -111,6 +114,7 @@ class Teller:
         self._tell_between(at_ns)
         held_back = self._pacer.holds_back(at_ns)
         if held_back:
+            self._pacer.held_back(self._clock.now_ns() - at_ns)
             return Untold(held_back, is_held_back=True)
         why_not = self._send(state, at_ns)
         if why_not is not None:
