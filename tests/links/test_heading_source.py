@@ -83,9 +83,15 @@ def test_a_restart_and_another_firmware_are_asked_again() -> None:
             source.is_of(Firmware.ARDUPILOT)  # the next heartbeat
             autopilot.parameters["EK3_SRC1_YAW"] = 1.0
             source.forget()
+            assert not source.was_own
             await until(lambda: source.is_own)
-            assert autopilot.asked == ["EK3_SRC1_YAW"] * 2
+            source.forget()
+            assert not source.is_own
+            assert source.was_own
+            await until(lambda: source.is_own)
+            assert autopilot.asked == ["EK3_SRC1_YAW"] * 3
             source.is_of(Firmware.PX4)
+            assert not source.was_own
             await until(lambda: "EKF2_MAG_TYPE" in autopilot.asked)
 
     asyncio.run(scenario())

@@ -86,14 +86,19 @@ def test_parameters_are_read_and_set_over_a_link_that_loses_half() -> None:
     asyncio.run(scenario())
 
 
-def test_what_the_autopilot_has_not_is_none() -> None:
+def test_what_the_autopilot_has_not_is_none_and_so_is_no_number() -> None:
     async def scenario() -> None:
         async with udp() as side:
-            vehicle = Vehicle(side, {})
+            no_numbers = {"NAN": float("nan"), "INFINITE": float("inf")}
+            told = {name: (struct.pack("<f", value), 9) for name, value in no_numbers.items()}
+            vehicle = Vehicle(side, told)
             options = AutopilotOptions(link=f"udp:127.0.0.1:{side.port}", profile="ardupilot")
             link = AutopilotLink(options, SYSTEM, ManualClock(1))
             async with running(link.run(), vehicle.run()):
                 assert await link.parameter("NO_SUCH") is None
+                for name in no_numbers:
+                    assert await link.parameter(name) is None
+                    assert vehicle.asked.count(name) == 2
                 # The first may go before the link is up.
                 assert 3 <= vehicle.asked.count("NO_SUCH") <= 4
 

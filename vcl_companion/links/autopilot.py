@@ -79,7 +79,11 @@ class AutopilotLink:
         )
         """Tells it where it is."""
         self.attitudes = TimedAttitude(
-            options, clock, self._ask_for_time, lambda: self.poses.has_sent
+            options,
+            clock,
+            self._ask_for_time,
+            is_told=lambda: self.poses.has_sent,
+            has_own_north=lambda: self._heading.was_own,
         )
         """What it says of how it is turned, by our clock."""
         self._state = ServiceState.STARTING

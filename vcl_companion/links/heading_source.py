@@ -40,12 +40,15 @@ class HeadingSource:
         self._changed = asyncio.Event()
         self.is_own = False
         """Whether its heading is its own; no, of one that has not said what it takes it from."""
+        self.was_own = False
+        """The same by what it said last, perhaps before it restarted."""
 
     def is_of(self, firmware: Firmware) -> None:
         """Note whose software the autopilot runs."""
         if firmware is not self._firmware:
             self._firmware = firmware
             self.forget()
+            self.was_own = self.is_own
 
     def forget(self) -> None:
         """Ask again: the autopilot has restarted, perhaps with other parameters."""
@@ -61,7 +64,7 @@ class HeadingSource:
             while self._firmware in (Firmware.ARDUPILOT, Firmware.PX4):
                 said = await self._asked()
                 if said is not None:
-                    self.is_own = said
+                    self.is_own = self.was_own = said
                     what = "its own" if said else "what we tell it"
                     _log.info("the autopilot's heading is %s", what)
                     break

@@ -7,6 +7,7 @@ An ArduPilot sends every value as a float; a PX4 sends an integer's four bytes i
 from __future__ import annotations
 
 import asyncio
+import math
 import struct
 from collections.abc import Callable
 from contextlib import suppress
@@ -30,6 +31,12 @@ def raw_of(value: float, kind: int, firmware: Firmware) -> bytes:
     """Return the four bytes of a value for a parameter of a type."""
     form = _form(kind, firmware)
     return form.pack(value if form is _FLOAT else round(value))
+
+
+def _said(message: ParameterValue, firmware: Firmware) -> float | None:
+    """Return a value; None where it is no number, by which nothing is said."""
+    value = value_of(message, firmware)
+    return value if math.isfinite(value) else None
 
 
 def _form(kind: int, firmware: Firmware) -> struct.Struct:
@@ -58,9 +65,9 @@ class Parameters:
             future.set_result(message)
 
     async def value(self, name: str, firmware: Firmware) -> float | None:
-        """Return a parameter's value; None when the autopilot has none of the name."""
+        """Return a parameter's value; None when the autopilot has none of the name, or a NaN."""
         message = await self._asked(name, lambda: self._read(name))
-        return None if message is None else value_of(message, firmware)
+        return None if message is None else _said(message, firmware)
 
     async def set(self, name: str, value: float, firmware: Firmware) -> float | None:
         """Set a parameter; return the value that it has then, None when it does not say."""
@@ -69,7 +76,7 @@ class Parameters:
             return None
         raw = raw_of(value, known.kind, firmware)
         message = await self._asked(name, lambda: self._write(name, raw, known.kind))
-        return None if message is None else value_of(message, firmware)
+        return None if message is None else _said(message, firmware)
 
     async def _asked(self, name: str, ask: Callable[[], None]) -> ParameterValue | None:
         for _ in range(_N_ATTEMPTS):

@@ -15,7 +15,8 @@ from vcl_companion.links.messages import (
 from vcl_companion.links.vision_pose import Firmware
 
 _CHECK_S = 1.0
-_LONGEST_PAUSE_S = 16.0
+# Without attitudes there are no poses, and no telling that the autopilot has restarted.
+_LONGEST_PAUSE_S, _LONGEST_WITHOUT_ATTITUDE_S = 16.0, 2.0
 _POSITION_HZ = 10.0
 _ESTIMATOR_HZ = 5.0
 _ESTIMATORS = {
@@ -26,7 +27,7 @@ _ESTIMATORS = {
 
 
 class StreamRequests:
-    """Asks for streams by MAV_CMD_SET_MESSAGE_INTERVAL, ever less often where one does not come.
+    """Asks for streams by MAV_CMD_SET_MESSAGE_INTERVAL, ever less often for one that does not come.
 
     Args:
         attitude_rate_hz: of ATTITUDE_QUATERNION.
@@ -50,18 +51,21 @@ class StreamRequests:
 
     async def run(self) -> None:
         """Ask for each stream while less than half of it comes, until cancelled."""
-        pause_s = _CHECK_S
+        pauses: dict[int, tuple[float, float]] = {}  # what is left of it, and how long it is
         while True:
             before = self._n_heard.copy()
-            await asyncio.sleep(pause_s)
-            missing = {
-                message_id: rate_hz
-                for message_id, rate_hz in self._wanted().items()
-                if self._n_heard[message_id] - before[message_id] < 0.5 * rate_hz * pause_s
-            }
-            for message_id, rate_hz in missing.items():
-                self._ask(message_id, round(1e6 / rate_hz))
-            pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S) if missing else _CHECK_S
+            await asyncio.sleep(_CHECK_S)
+            for message_id, rate_hz in self._wanted().items():
+                if self._n_heard[message_id] - before[message_id] >= 0.5 * rate_hz * _CHECK_S:
+                    pauses.pop(message_id, None)
+                    continue
+                left_s, pause_s = pauses.get(message_id, (0.0, _CHECK_S))
+                if left_s <= 0.0:
+                    self._ask(message_id, round(1e6 / rate_hz))
+                    is_attitude = message_id == ATTITUDE_QUATERNION_ID
+                    longest_s = _LONGEST_WITHOUT_ATTITUDE_S if is_attitude else _LONGEST_PAUSE_S
+                    left_s, pause_s = pause_s, min(2.0 * pause_s, longest_s)
+                pauses[message_id] = left_s - _CHECK_S, pause_s
 
     def _wanted(self) -> dict[int, float]:
         """Return the rate of each stream, Hz."""

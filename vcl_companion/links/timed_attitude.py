@@ -25,6 +25,8 @@ _SYNC_FAST_S, _SYNC_SLOW_S = 0.1, 1.0
 _SYNC_ENOUGH = 8
 # After this many unanswered questions (1 s) the autopilot does without TIMESYNC.
 _SYNC_GIVEN_UP = 10
+# A compass is taken in some seconds after the start.
+_FINDS_NORTH_MS = 20_000
 
 
 class TimedAttitude:
@@ -36,6 +38,8 @@ class TimedAttitude:
         ask: sends a TIMESYNC question, ns by our clock.
         is_told: whether the autopilot has been told poses: what it turns its north by before is
             its own.
+        has_own_north: whether, as far as is known, its heading is by a compass: one that has
+            restarted finds that anew soon, told poses or not, and what it said before was none.
     """
 
     def __init__(
@@ -44,6 +48,7 @@ class TimedAttitude:
         clock: Clock,
         ask: Callable[[int], None],
         is_told: Callable[[], bool],
+        has_own_north: Callable[[], bool] = lambda: False,
     ) -> None:
         latency_ns = round(options.attitude_latency_s * 1e9)
         max_age_ns = round(options.max_attitude_age_s * 1e9)
@@ -52,6 +57,8 @@ class TimedAttitude:
         self._clock = clock
         self._ask = ask
         self._is_told = is_told
+        self._has_own_north = has_own_north
+        self._has_restarted = False
         self._sync = TimesyncEstimator()
         self._asked_at_s = -math.inf
         self._news = asyncio.Event()
@@ -143,12 +150,15 @@ class TimedAttitude:
         taken = history.add(sample, self._clock.now_ns())
         if taken == "turned":
             degrees = math.degrees(history.north_rad)
-            if self._is_told():
+            is_new = self._has_restarted and sample.time_boot_ms < _FINDS_NORTH_MS
+            is_new = is_new and self._has_own_north()
+            if self._is_told() and not is_new:
                 _log.info("the autopilot has turned its north, by %.1f degrees so far", degrees)
             else:
                 history.take_its_north()
                 _log.info("the autopilot has found its north, by %.1f degrees", degrees)
         elif taken == "rebooted":
+            self._has_restarted = True
             self._sync.reset()
             (self._by_euler if quaternion else self._by_quaternion).clear()
         self._wake()
