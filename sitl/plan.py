@@ -20,8 +20,11 @@ from sitl.partitions import check_partitions
 from vcl_companion.config import Config
 from vcl_companion.errors import ConfigError
 from vcl_companion.recording import Drone, KnownPair, Recording
+from vcl_companion.recording.sensor import nominal_rate_hz
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+# Whose frames come so many times as fast as its camera's are not stamped in nanoseconds.
+_MOST_TIMES_RATE = 100.0
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ class FlyOptions:
             maps included.
         attitude: output folder of an earlier flight whose attitude streams are sent again.
         known_distances: instead of the recording's; a pair without metres is taken
-            from the truth at the start.
+            from the truth when all are there.
         drones: names of those that fly; empty: all.
         start_timeout_s: how long the daemons have to come up, and again to make the first map.
         settings: more of the daemons' configuration.
@@ -206,12 +209,14 @@ def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:
         for n, drone in enumerate(recording.drones)
         if drone.name in flying
     )
-    pairs = _known_pairs(recording, drones, options.known_distances)
+    for planned in drones:
+        _check_instants(planned.drone)
+    pairs = _known_pairs(recording, drones, options.known_distances, options.absences)
     plan = FlightPlan(
         recording=recording,
         drones=drones,
         leader=recording.leader if recording.leader in flying else flying[0],
-        known_distances=_known_distances(drones, pairs),
+        known_distances=_known_distances(drones, pairs, options.absences),
         are_distances_true=bool(pairs) and all(pair.distance_m is None for pair in pairs),
         options=options,
     )
@@ -240,7 +245,10 @@ def _attitude_path(drone: Drone, options: FlyOptions) -> Path | None:
 
 
 def _known_pairs(
-    recording: Recording, drones: Sequence[PlannedDrone], given: Sequence[KnownPair]
+    recording: Recording,
+    drones: Sequence[PlannedDrone],
+    given: Sequence[KnownPair],
+    absences: Sequence[Absence],
 ) -> Sequence[KnownPair]:
     names = [drone.name for drone in drones]
     for pair in given:
@@ -250,6 +258,12 @@ def _known_pairs(
         if sum({pair.a, pair.b} == {other.a, other.b} for other in given) > 1:
             raise ConfigError(f"--known-distance {pair.a}:{pair.b}: is given twice")
     pairs = given or [p for p in recording.known_distances if {p.a, p.b} <= set(names)]
+    late = {absence.drone for absence in absences if absence.from_s == 0.0}
+    if not given and any({p.a, p.b} & late for p in pairs):
+        # How far who comes late is away then nobody has measured.
+        there = [d.name for d in drones if d.name not in late and d.drone.truth is not None][:2]
+        of_others = [KnownPair(there[0], there[1], None)] if len(there) == 2 else pairs
+        pairs = [p for p in pairs if not {p.a, p.b} & late] or of_others
     if not pairs and len(drones) > 1:
         raise ConfigError(
             f"{recording.path}: no distance is known between two of {', '.join(names)}; "
@@ -258,8 +272,24 @@ def _known_pairs(
     return pairs
 
 
+def _check_instants(drone: Drone) -> None:
+    """Refuse a truth of another time, and instants that are no nanoseconds."""
+    at_ns = np.array([frame.at_ns for frame in drone.frames], dtype=np.int64)
+    if drone.truth is not None and not any(drone.truth.pose_at(int(t)) for t in at_ns):
+        raise ConfigError(
+            f"{drone.name}: frames from {at_ns[0]} to {at_ns[-1]} ns, and no ground truth of any: "
+            "are both stamped by one clock?"
+        )
+    rate_hz = nominal_rate_hz(at_ns.tolist())
+    if rate_hz > _MOST_TIMES_RATE * drone.sensor.rate_hz:
+        raise ConfigError(
+            f"{drone.name}: {rate_hz:g} frames a second by their instants, "
+            f"{drone.sensor.rate_hz:g} by its sensor.yaml: instants are nanoseconds"
+        )
+
+
 def _known_distances(
-    drones: Sequence[PlannedDrone], pairs: Sequence[KnownPair]
+    drones: Sequence[PlannedDrone], pairs: Sequence[KnownPair], absences: Sequence[Absence]
 ) -> tuple[tuple[int, int, float], ...]:
     by_name = {drone.name: drone for drone in drones}
     out = []
@@ -267,7 +297,7 @@ def _known_distances(
         one, other = by_name[pair.a], by_name[pair.b]
         distance_m = pair.distance_m
         if distance_m is None:
-            distance_m = _true_distance_m(one, other)
+            distance_m = _true_distance_m(one, other, _all_there_ns(drones, pair, absences))
         if distance_m is None:
             raise ConfigError(
                 f"the truth does not say how far {pair.a} is from {pair.b} at the start; "
@@ -277,12 +307,25 @@ def _known_distances(
     return tuple(out)
 
 
-def _true_distance_m(a: PlannedDrone, b: PlannedDrone) -> float | None:
-    """Return how far two drones are apart at their first frames, by the truth."""
+def _all_there_ns(
+    drones: Sequence[PlannedDrone], pair: KnownPair, absences: Sequence[Absence]
+) -> int:
+    """Return when a first map can be made whose scale a pair gives: the recording waits for it."""
+    late_s = {absence.drone: absence.until_s for absence in absences if absence.from_s == 0.0}
+    first_ns = {drone.name: int(drone.frames_at_ns[0]) for drone in drones}
+    needed = [name for name in first_ns if name not in late_s or name in (pair.a, pair.b)]
+    begins_ns = min(first_ns.values())
+    return max(max(first_ns[n], begins_ns + round(late_s.get(n, 0.0) * 1e9)) for n in needed)
+
+
+def _true_distance_m(a: PlannedDrone, b: PlannedDrone, at_ns: int) -> float | None:
+    """Return how far two drones are apart at their newest frames of then, by the truth."""
     starts = []
     for planned in (a, b):
         truth = planned.drone.truth
-        start = truth.pose_at(planned.drone.frames[0].at_ns) if truth else None
+        n_come = int(np.searchsorted(planned.frames_at_ns, at_ns, side="right"))
+        newest_ns = int(planned.frames_at_ns[max(n_come - 1, 0)])
+        start = truth.pose_at(newest_ns) if truth else None
         if start is None:
             return None
         starts.append(start.translation)

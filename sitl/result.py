@@ -373,7 +373,13 @@ def _map_points(folder: Path, maps: Sequence[MapRow]) -> Array:
 
 def _logged(plan: FlightPlan, logs: dict[str, FlightLog]) -> list[Event]:
     return [
-        Event((row.at_ns - plan.starts_at_ns) * 1e-9, name, row.event, row.reason or "")
+        # A daemon that was not told the time yet has said 0.
+        Event(
+            (row.at_ns - plan.starts_at_ns) * 1e-9 if row.at_ns else 0.0,
+            name,
+            row.event,
+            row.reason or "",
+        )
         for name, log in logs.items()
         for row in log.events
     ]

@@ -247,7 +247,6 @@ def test_every_answer_arrives_even_when_the_daemon_hangs_up() -> None:
     [
         ([], "ended without an end record"),
         ([b"GET / HTTP/1.1\r\n" * 2], "not a record of this protocol"),
-        ([StreamFrame(0, 1, b"nonsense")], "undecodable image of 8 bytes"),
         (
             [StreamFrame(0, 1, png(picture(0, (16, 8))))],
             "frame 0 is 16x8, the calibration says 32x24",
@@ -270,6 +269,20 @@ def test_a_broken_stream_is_one_clear_line(records: list[Record | bytes], why: s
     with pytest.raises(DeviceError, match=rf"^camera stream 127\.0\.0\.1:\d+: {why}") as caught:
         asyncio.run(scenario())
     assert "\n" not in str(caught.value)
+
+
+def test_an_image_that_cannot_be_decoded_is_refused_and_left_out(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    images = [png(picture(0)), b"nonsense", png(picture(2))]
+    records = [StreamFrame(k, k + 1, data) for k, data in enumerate(images)]
+
+    async def scenario() -> list[int]:
+        async with camera_of(serving(*records, StreamEnd(4)), SystemClock()) as camera:
+            return [frame.sequence for frame in await all_frames(camera)]
+
+    assert asyncio.run(scenario()) == [0, 2]
+    assert "frame 1 is left out: undecodable image of 8 bytes" in caplog.text
 
 
 def test_closing_ends_the_frames_without_an_error() -> None:

@@ -14,6 +14,7 @@ from vcl_companion.recording.sensor import (
     NED_FROM_REFERENCE,
     ReferenceAxes,
     Sensor,
+    check_lens,
     nominal_rate_hz,
     read_sensor,
     write_sensor,
@@ -180,3 +181,23 @@ def test_axes_are_rotations_with_the_right_down() -> None:
         assert np.linalg.det(matrix) == pytest.approx(1.0, abs=1e-12)
         np.testing.assert_array_equal(matrix @ up[axes], [0.0, 0.0, -1.0])
         np.testing.assert_array_equal(matrix @ north[axes], [1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("367.215, 248.375", "752.0, 248.375", "another resolution"),
+        ("367.215, 248.375", "367.215, -1.0", "another resolution"),
+        ("[-0.28340811, 0.07395907,", "[-3.0, 0.0,", "no ray reaches"),
+    ],
+)
+def test_what_no_lens_is_is_one_line(tmp_path: Path, old: str, new: str, says: str) -> None:
+    path = tmp_path / "sensor.yaml"
+    path.write_text(EUROC)
+    check_lens(path, read_sensor(path).camera)
+    assert old in EUROC
+    path.write_text(EUROC.replace(old, new))
+    with pytest.raises(RecordingError, match=says) as raised:
+        check_lens(path, read_sensor(path).camera)
+    assert str(raised.value).startswith(f"{path}: ")
+    assert "\n" not in str(raised.value)

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sitl.absences import Absence
 from sitl.fly import fly
 from sitl.out_folder import prepare_folder
 from sitl.plan import FlyOptions, Setting, parse_known_distance, parse_setting, plan_flight
@@ -47,6 +48,68 @@ def test_a_distance_without_metres_is_the_truth_s_at_the_start(recording: Record
     ((a, b, distance_m),) = plan.known_distances
     assert (a, b) == (1, 3)
     assert distance_m == pytest.approx(np.linalg.norm(apart), abs=1e-9)
+
+
+def apart_m(one: int, k: int, other: int, n: int) -> float:
+    """Return how far a drone's k-th frame is from another's n-th."""
+    apart = ned_from_body(one, k).translation - ned_from_body(other, n).translation
+    return float(np.linalg.norm(apart))
+
+
+def beginning_late(recording: Recording, name: str) -> Recording:
+    return replace(
+        recording,
+        drones=tuple(
+            replace(d, frames=d.frames[1:]) if d.name == name else d for d in recording.drones
+        ),
+    )
+
+
+@pytest.mark.parametrize("who", ["mav0", "mav1", "mav2"])
+def test_the_truth_s_distance_is_that_of_when_all_are_there(recording: Recording, who: str) -> None:
+    options = FlyOptions(known_distances=(KnownPair("mav0", "mav2"),))
+    ((_, _, distance_m),) = plan_flight(beginning_late(recording, who), options).known_distances
+    first_ns = {"mav0": at_ns(0, 0), "mav1": at_ns(1, 0), "mav2": at_ns(2, 0)}
+    second_ns = {"mav0": at_ns(0, 1), "mav1": at_ns(1, 1), "mav2": at_ns(2, 1)}
+    all_there_ns = max(*(first_ns[n] for n in first_ns if n != who), second_ns[who])
+    newest = {n: 1 if n == who or second_ns[n] <= all_there_ns else 0 for n in ("mav0", "mav2")}
+    assert distance_m == pytest.approx(apart_m(0, newest["mav0"], 2, newest["mav2"]), abs=1e-9)
+
+
+def test_who_comes_late_is_as_far_away_as_it_is_then(tmp_path: Path) -> None:
+    recording = read_recording(write_recording(tmp_path / "four", Flight(n_frames=4, n_drones=3)))
+    late_s = (at_ns(2, 1) - at_ns(0, 0)) * 1e-9
+    options = FlyOptions(
+        known_distances=(KnownPair("mav0", "mav2"),), absences=(Absence("mav2", 0.0, late_s),)
+    )
+    ((_, _, distance_m),) = plan_flight(recording, options).known_distances
+    assert distance_m == pytest.approx(apart_m(0, 1, 2, 1), abs=1e-9)
+
+
+def test_no_distance_of_who_comes_late_is_known_while_two_others_are_there(
+    tmp_path: Path,
+) -> None:
+    recording = read_recording(write_recording(tmp_path / "four", Flight(n_frames=4, n_drones=3)))
+    plan = plan_flight(recording, FlyOptions(absences=(Absence("mav1", 0.0, 0.2),)))
+    ((a, b, distance_m),) = plan.known_distances
+    assert (a, b) == (1, 3)
+    assert distance_m == pytest.approx(apart_m(0, 0, 2, 0), abs=1e-9)
+    assert plan.are_distances_true
+
+
+def test_instants_that_fit_nothing_are_refused(recording: Recording) -> None:
+    drone = recording.drones[1]
+    day_ns = 86_400 * 1_000_000_000
+    other_day = replace(
+        drone, frames=tuple(replace(f, at_ns=f.at_ns + day_ns) for f in drone.frames)
+    )
+    in_microseconds = replace(
+        drone, sensor=replace(drone.sensor, rate_hz=drone.sensor.rate_hz / 1000.0)
+    )
+    for wrong, says in ((other_day, "stamped by one clock"), (in_microseconds, "are nanoseconds")):
+        drones = (recording.drones[0], wrong, recording.drones[2])
+        with pytest.raises(ConfigError, match=f"^mav1: .*{says}"):
+            plan_flight(replace(recording, drones=drones), FlyOptions())
 
 
 def test_an_earlier_flight_s_attitude_needs_no_truth(recording: Recording, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from vcl_companion.cameras.source import CameraOptions
 from vcl_companion.geometry.rotation import Array, euler_from_matrix, matrix_from_euler
-from vcl_companion.recording.sensor import BODY_FROM_CAM_FORWARD, Sensor, read_sensor
+from vcl_companion.recording.sensor import BODY_FROM_CAM_FORWARD, Sensor, check_lens, read_sensor
 
 _SIDES = (("forward", "back"), ("right", "left"), ("down", "up"))
 
@@ -38,11 +38,14 @@ def read_calibration(options: CameraOptions) -> Sensor:
         RecordingError: it cannot be used, or nobody says how the camera sits.
     """
     mounting, position_m = options.mounting_deg, options.position_m
-    return read_sensor(
-        Path(options.calibration),
+    path = Path(options.calibration)
+    sensor = read_sensor(
+        path,
         rotation=None if mounting is None else mounted_rotation(mounting),
         position_m=None if position_m is None else np.array(position_m),
     )
+    check_lens(path, sensor.camera)
+    return sensor
 
 
 def mounting_text(body_from_cam: Array) -> str:

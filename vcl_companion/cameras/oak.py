@@ -78,7 +78,11 @@ class OakCamera:
                     if sequence < next_sequence or captured_at_ns <= last_ns:
                         continue
                     next_sequence, last_ns = sequence + 1, captured_at_ns
-                    image = await asyncio.to_thread(decode_image, record.encoded)
+                    try:
+                        image = await asyncio.to_thread(decode_image, record.encoded)
+                    except WireError as error:
+                        _log.warning("OAK camera: frame %d is left out: %s", sequence, error)
+                        continue
                     if image.shape[::-1] != self._size_px:
                         raise DeviceError(f"OAK camera: gives {image.shape[1]}x{image.shape[0]}")
                     yield Frame(image, captured_at_ns, sequence, received_at_ns)

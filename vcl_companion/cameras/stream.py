@@ -30,6 +30,7 @@ sequence      u64     of the frame or the question that this answers
 from __future__ import annotations
 
 import asyncio
+import logging
 import struct
 import time
 from collections.abc import AsyncIterator, Callable
@@ -55,6 +56,8 @@ Word = Outcome | Literal["idle", "busy"]
 _CODES: dict[Word, int] = {"localized": 1, "refused": 2, "dropped": 3, "idle": 4, "busy": 5}
 _WORDS = {code: outcome for outcome, code in _CODES.items()}
 _END_OF_TIME_NS = 2**63
+
+_log = logging.getLogger(__name__)
 
 _CONNECT_WITHIN_S = 10.0
 _RETRY_AFTER_S = 0.1
@@ -232,7 +235,12 @@ class StreamCamera:
                     raise WireError(f"frame {record.sequence} does not follow frame {sequence}")
                 sequence, at_ns = record.sequence, record.at_ns
                 # Beside the loop: a large PNG takes tens of milliseconds, a heartbeat cannot wait.
-                image = await asyncio.to_thread(decode_image, record.encoded)
+                try:
+                    image = await asyncio.to_thread(decode_image, record.encoded)
+                except WireError as error:
+                    _log.warning("frame %d is left out: %s", sequence, error)
+                    self._say(sequence, "refused")
+                    continue
                 if image.shape[::-1] != self._size_px:
                     raise WireError(
                         f"frame {sequence} is {image.shape[1]}x{image.shape[0]}, "

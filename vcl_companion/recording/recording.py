@@ -27,6 +27,7 @@ from vcl_companion.recording.sensor import (
     NED_FROM_REFERENCE,
     ReferenceAxes,
     Sensor,
+    check_lens,
     read_extrinsics,
     read_fields,
     read_reference_axes,
@@ -158,7 +159,9 @@ def _read_folder(path: Path) -> Recording:
 
 
 def _read_drone(folder: Path, default_axes: ReferenceAxes) -> Drone:
-    sensor = read_sensor(folder / CAMERA_FOLDER / "sensor.yaml", default_axes)
+    path = folder / CAMERA_FOLDER / "sensor.yaml"
+    sensor = read_sensor(path, default_axes)
+    check_lens(path, sensor.camera)
     truth_fields_path = folder / TRUTH_FOLDER / "sensor.yaml"
     body_from_truth = Pose.identity()
     if truth_fields_path.exists():

@@ -133,14 +133,35 @@ def read_sensor(
     if position_m is not None:
         body_from_cam = Pose(body_from_cam.rotation, position_m)
     try:
-        return Sensor(
-            Camera(int(width), int(height), fx, fy, cx, cy, distortion_model, distortion),
-            body_from_cam,
-            rate_hz,
-            read_reference_axes(path, fields) or default_axes,
-        )
+        camera = Camera(int(width), int(height), fx, fy, cx, cy, distortion_model, distortion)
+        axes = read_reference_axes(path, fields) or default_axes
+        return Sensor(camera, body_from_cam, rate_hz, axes)
     except ValueError as error:
         raise RecordingError(f"{path}: {error}") from None
+
+
+def check_lens(path: Path, camera: Camera) -> None:
+    """Refuse what no lens is, as when images were scaled and their intrinsics were not.
+
+    Args:
+        path: the file that it was read from.
+        camera: the intrinsics.
+
+    Raises:
+        RecordingError: one line with file and key.
+    """
+    last = np.array([camera.width_px - 1, camera.height_px - 1])
+    centre = np.array([camera.cx_px, camera.cy_px])
+    if not (np.all(centre >= 0.0) and np.all(centre <= last)):
+        raise RecordingError(
+            f"{path}: intrinsics: the principal point {camera.cx_px:g}, {camera.cy_px:g} lies "
+            f"outside of {camera.width_px}x{camera.height_px} px; are they of another resolution?"
+        )
+    sides = np.array([[0.0, 0.5], [1.0, 0.5], [0.5, 0.0], [0.5, 1.0]]) * last
+    if not np.isfinite(camera.ideal_from_pixels(sides)).all():
+        raise RecordingError(
+            f"{path}: distortion_coefficients: no ray reaches the middle of each side of the image"
+        )
 
 
 def write_sensor(path: Path, sensor: Sensor) -> None:
