@@ -42,6 +42,10 @@ class ConsistencyOptions:
     novelty_deg: float = UpdateOptions().novelty_deg
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        if not 0.0 < self.novelty_deg <= 90.0:
+            raise ConfigError(f"--novelty must lie in 0..90 degrees, got {self.novelty_deg}")
+
 
 def consistency(
     recordings: Sequence[Path], out: Path, options: ConsistencyOptions, told: Told

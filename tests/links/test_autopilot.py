@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator
 import numpy as np
 import pytest
 
+from tests.daemon.waiting import hurry, run, until
 from tests.links import wire
 from tests.links.running import Udp, running, udp
 from vcl_companion.clock import ManualClock
@@ -399,3 +400,30 @@ def test_what_is_too_old_is_not_sent_and_what_is_late_is_told_vaguely() -> None:
             assert math.isclose(sigmas[2], math.hypot(0.01, 2.0 * 0.5), rel_tol=1e-3)
 
     asyncio.run(scenario())
+
+
+def test_an_autopilot_that_is_not_heard_is_told_of_once(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+
+    async def scenario() -> None:
+        async with udp() as side:
+            options = AutopilotOptions(link=f"udp:127.0.0.1:{side.port}")
+            link, autopilot = (
+                AutopilotLink(options, SYSTEM, ManualClock(NOW_NS)),
+                FakeAutopilot(side),
+            )
+            working = asyncio.create_task(link.run())
+            await autopilot.answer_question()
+            for _ in range(13):
+                hurry(1.0)
+                await asyncio.sleep(0.002)
+            assert not link.is_heard
+            autopilot.say(wire.packed(wire.HEARTBEAT, 0, 2, 3, 81, 4, 3, system=SYSTEM))
+            await until(lambda: link.is_heard)
+            working.cancel()
+
+    run(scenario())
+    texts = [record.getMessage() for record in caplog.records]
+    silent, heard = (text for text in texts if "heartbeat" in text or "is heard" in text)
+    assert silent.startswith("no heartbeat of an autopilot of system 7 in 10 s over udp:127.0.0.1")
+    assert heard == "the autopilot is heard"

@@ -30,6 +30,7 @@ from vcl_companion.mapping.contributing import without_alike
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.novelty import NEAR_DEG
 from vcl_companion.mapping.options import MapOptions, NoMap
+from vcl_companion.mapping.reconstruction import lacks
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.pace import look_s
 from vcl_companion.swarm.updates import UpdateOptions, UpdateTrigger
@@ -236,9 +237,17 @@ class MapRounds:
             frame.captured_at_ns, contributors, timeout_s=self._options.map.gather_timeout_s
         )
         frames = await self._gathered(frame, wanted, self._has_map)
-        built = await self._built(frames, lambda frames: self._work.first_map(frames, origin))
+        lacking = ""
+        if isinstance(frames, list):
+            lacking = lacks({f.drone_id: f.ned_from_body for f in frames}, origin)
+        if lacking:
+            built: LandmarkMap | NoMap = NoMap(lacking)
+        else:
+            built = await self._built(frames, lambda frames: self._work.first_map(frames, origin))
         if not self._has_map():
             await self._decide(built, None, request_id)
+        if lacking:  # and will for a while: before take-off, for minutes
+            await asyncio.sleep(self._options.update.interval_s)
 
     async def _next_revision(self, stored: StoredMap, frame: Frame) -> None:
         update = self._options.update
@@ -385,7 +394,9 @@ class MapRounds:
             for answer in described:
                 self._passed.pass_on(answer)
         gathered = described + theirs.result()
-        _log.info("%d frames gathered in %.1f s", len(gathered), self._now_s() - began_s)
+        alone = self._maps.current is None and len(gathered) < 2
+        level = logging.DEBUG if alone else logging.INFO
+        _log.log(level, "%d frames gathered in %.1f s", len(gathered), self._now_s() - began_s)
         return gathered
 
     async def _own(self, newest: Frame, wanted: Wanted) -> list[FrameAnswer] | NoMap:

@@ -88,7 +88,7 @@ class StatusWriter:
             AutopilotStatus(
                 self._autopilot.firmware.value,
                 fusion.state.value,
-                fusion.reason,
+                fusion.reason if self._autopilot.is_heard else "it is not heard",
                 None if ahead_s is None else 1e3 * ahead_s,
                 None if round_trip_s is None else 1e3 * round_trip_s,
             ),

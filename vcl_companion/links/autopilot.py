@@ -53,6 +53,8 @@ from vcl_companion.links.vision_pose import Firmware, firmware_of
 _log = logging.getLogger(__name__)
 
 _HEARTBEAT_S = 1.0
+# Whole heartbeats of ours in which an autopilot's would have come.
+_SILENT_S = 10.0
 _FIRMWARE = {"ardupilot": Firmware.ARDUPILOT, "px4": Firmware.PX4}
 
 
@@ -104,6 +106,8 @@ class AutopilotLink:
         for told in self._told_firmware:
             told.firmware = self._firmware
         self._mode = VehicleMode()
+        self._link = options.link
+        self._silent_s = 0.0
 
     @property
     def options(self) -> AutopilotOptions:
@@ -150,6 +154,11 @@ class AutopilotLink:
     def send(self, message: Any) -> None:
         """Send one of ``own_messages``."""
         self._transport.write(self._codec.frame(message))
+
+    @property
+    def is_heard(self) -> bool:
+        """Whether it has sent a heartbeat lately, or we have not listened for long yet."""
+        return self._silent_s < _SILENT_S
 
     @property
     def is_silent(self) -> bool:
@@ -239,6 +248,9 @@ class AutopilotLink:
             case GlobalOrigin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude):
                 self.origin.said(GlobalPlace(latitude, longitude, altitude))
             case Heartbeat():
+                if self._silent_s >= _SILENT_S:
+                    _log.info("the autopilot is heard")
+                self._silent_s = 0.0
                 self._mode = mode_of(message)
                 self.origin.is_armed = self._mode.is_armed
                 if self.options.profile == "auto":
@@ -313,6 +325,15 @@ class AutopilotLink:
         while True:
             await asyncio.sleep(_HEARTBEAT_S)
             self.send_heartbeat()
+            self._silent_s += _HEARTBEAT_S
+            if self._silent_s == _SILENT_S:
+                _log.warning(
+                    "no heartbeat of an autopilot of system %d in %.0f s over %s: is it on, and "
+                    "are autopilot.link and system_id right?",
+                    self._system_id,
+                    _SILENT_S,
+                    self._link,
+                )
 
     def _ask_for_time(self, now_ns: int) -> None:
         self._transport.write(self._codec.timesync(0, now_ns))

@@ -55,7 +55,10 @@ class KeptSigning:
         self._file: TimestampFile | None = None
         key, left = None, Timestamps()
         if key_file:
-            key = read_key_file(Path(key_file))
+            try:
+                key = read_key_file(Path(key_file))
+            except ConfigError as error:
+                raise ConfigError(f"[peers] key_file: {error}") from error
             if timestamp_file:
                 self._file = TimestampFile(Path(timestamp_file))
                 left = self._file.read()

@@ -143,8 +143,11 @@ def parse_peers(listen: str, to: Sequence[str]) -> tuple[Address, tuple[Address,
     """
     listen_address = _numeric(listen, "listen")
     destinations = tuple(_numeric(text, "to") for text in to)
-    if len(destinations) > _MAX_PEERS or len(set(destinations)) != len(destinations):
-        raise ConfigError(f"to: at most {_MAX_PEERS} different addresses")
+    if len(destinations) > _MAX_PEERS:
+        raise ConfigError(f"to: at most {_MAX_PEERS} addresses, got {len(destinations)}")
+    for text, there in zip(to, destinations, strict=True):
+        if destinations.count(there) > 1:
+            raise ConfigError(f"to: {text} is there twice")
     for host, port in destinations:
         if port == 0:
             raise ConfigError(f"to: {host} needs a port")

@@ -7,8 +7,11 @@ distance and placed in the world by the leader's attitude.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
+from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
@@ -21,7 +24,23 @@ from vcl_companion.mapping.uncertainty import map_uncertainty
 from vcl_companion.mapping.visibility import Edge, visibility_graph
 from vcl_companion.vision.essential import RelativePose
 
-__all__ = ["MapOptions", "NoMap", "accepted", "reconstruct"]
+__all__ = ["MapOptions", "NoMap", "accepted", "lacks", "reconstruct"]
+
+
+def lacks(attitudes: Mapping[int, Array | None], leader: int) -> str:
+    """Say what a first map lacks, before anything is looked at; empty for nothing.
+
+    Args:
+        attitudes: of the drones that an image has come of, None where their autopilots say none.
+        leader: system id of the drone whose body is the world's origin.
+    """
+    if leader not in attitudes:
+        return f"the leader, drone {leader}, has sent no image"
+    if attitudes[leader] is None:
+        return f"the autopilot of the leader, drone {leader}, sends no attitude"
+    if len(attitudes) < 2:
+        return "a first map needs the images of two drones, one has come"
+    return ""
 
 
 def reconstruct(
@@ -44,14 +63,10 @@ def reconstruct(
         A metric map whose first keyframe is the leader's, or the reason why not.
         A drone that overlaps nobody is left out of it.
     """
-    first = next((i for i, d in enumerate(drones) if d.drone_id == leader), None)
-    if first is None:
-        return NoMap(f"the leader, drone {leader}, has sent no image")
-    drones = [drones[first], *drones[:first], *drones[first + 1 :]]
-    if drones[0].ned_from_body is None:
-        return NoMap(f"the autopilot of the leader, drone {leader}, sends no attitude")
-    if len(drones) < 2:
-        return NoMap("a first map needs the images of two drones, one has come")
+    lacking = lacks({d.drone_id: d.ned_from_body for d in drones}, leader)
+    if lacking:
+        return NoMap(lacking)
+    drones = sorted(drones, key=lambda d: d.drone_id != leader)
     graph = visibility_graph(drones, options, seed)
     reasons: list[str] = []
     for pair in sorted(graph, key=lambda p: len(graph[p].matches.a), reverse=True):
