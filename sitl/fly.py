@@ -136,9 +136,11 @@ def _ended_by_sigterm() -> Iterator[None]:
 
     def end() -> None:
         nonlocal asked
-        asked = True
-        if task is not None:
+        # `timeout` sends it to the process and once more to its group: what is put in order by
+        # then is not interrupted.
+        if task is not None and not asked:
             task.cancel()
+        asked = True
 
     loop.add_signal_handler(signal.SIGTERM, end)
     try:

@@ -155,6 +155,9 @@ class FrameServer:
                 await self._take(answer)
         except (WireError, OSError) as error:
             failure = f"daemon of {self.drone}, camera stream: {error}"
+        except asyncio.CancelledError:
+            # Python 3.11 prints a traceback for a task of a server that ends as cancelled.
+            failure = "the flight was ended"
         finally:
             async with self._changed:
                 self._failure = failure

@@ -70,6 +70,14 @@ def test_a_px4_whose_clock_is_not_known_does_not_fuse() -> None:
     assert "origin" not in checks
 
 
+def test_one_that_answers_no_question_for_a_parameter_is_not_taken_to_have_none() -> None:
+    checks = checks_of(3, {})
+    assert checks["parameters"].grade == "failure"
+    assert "answers no question" in checks["parameters"].what
+    assert "EK3_ENABLE" not in checks
+    assert "AHRS_EKF_TYPE" not in checks
+
+
 def test_a_px4_with_height_by_vision_is_warned_of_an_origin() -> None:
     checks = checks_of(12, {**PX4, "EKF2_HGT_REF": 3.0})
     assert checks["origin"].grade == "warning"

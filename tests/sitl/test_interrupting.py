@@ -76,3 +76,18 @@ def test_workers_say_nothing_on_ctrl_c_and_end_at_once(tmp_path: Path) -> None:
     for pidfd in pidfds:
         assert select.select([pidfd], [], [], 10.0)[0], "a worker still runs"
         os.close(pidfd)
+
+
+def test_a_flight_that_is_ended_twice_at_once_ends_without_a_traceback(tmp_path: Path) -> None:
+    """As `timeout` does it: the process, and then its group."""
+    with started("-m", "sitl", "fly", "demo", "--out", str(tmp_path / "out")) as process:
+        assert process.stdout is not None
+        said = ""
+        while "making the first map" not in said:
+            assert process.poll() is None
+            said += process.stdout.readline()
+        for _ in range(2):
+            os.killpg(process.pid, signal.SIGTERM)
+        said, _ = process.communicate(timeout=TIMEOUT_S)
+    assert "Traceback" not in said
+    assert process.returncode == 128 + signal.SIGTERM

@@ -29,6 +29,8 @@ _HEARTBEAT_S = 5.0
 _STREAM_S = 2.5
 _LEAST_ATTITUDE_SHARE = 0.5
 _ROUND_TRIP_S = 0.05
+# So many of the parameters that are asked for first every autopilot of its firmware has.
+_ALL_HAVE = 2
 # How long somebody may take to turn the drone to all sides.
 TILT_S = 40.0
 _GRADE_OF: dict[str, Grade] = {
@@ -161,8 +163,15 @@ async def of_autopilot(config: Config, link: AutopilotLink) -> tuple[list[Check]
         sends_velocity=config.autopilot.message == "odometry",
         sets_origin=config.autopilot.origin is not None,
     )
-    values = {}
-    for name in names_of(rules):
+    values: dict[str, float] = {}
+    for n_asked, name in enumerate(names_of(rules)):
+        if n_asked == _ALL_HAVE and not values:
+            # Each question takes two seconds, and what is not said is not known to be lacking.
+            what = "the autopilot answers no question for a parameter"
+            advice = (
+                "does the link carry what we send? does a router let PARAM_REQUEST_READ through?"
+            )
+            return [*checks, Check("parameters", "failure", what, advice)], []
         value = await link.parameter(name)
         if value is not None:
             values[name] = value
