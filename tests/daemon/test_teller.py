@@ -244,7 +244,7 @@ def test_frames_that_nobody_looks_at_are_not_remembered_for_ever(tmp_path: Path)
         async with flying(tmp_path) as up:
             for k in range(1000):
                 up.teller.arrived(START_NS + k * 33 * MS)
-            assert len(up.teller._unseen) < 20
+            assert len(up.teller._unseen) < 200
 
     run(scenario())
 

@@ -30,9 +30,9 @@ from vcl_companion.localization.pose_filter import FilterState
 
 _log = logging.getLogger(__name__)
 
-# While there is no map no frame is looked at, and none after another: only the last few hold poses
-# up. No more than these are on their way at a time.
-_MOST_UNSEEN = 15
+# While there is no map no frame is looked at: they are not remembered for ever. Far fewer wait for
+# one that is searched for.
+_MOST_UNSEEN = 100
 # After so long without a pose nobody knows from it where the autopilot takes us to be.
 _SILENT_NS = 1_000_000_000
 # Of the information of one pose, in all those between two frames.
