@@ -51,7 +51,7 @@ class Check:
 
 
 def of_files(config: Config) -> Iterable[Check]:
-    """Look at calibration, key, disk."""
+    """Look at calibration, key, known distance, disk."""
     yield _of_calibration(config.camera)
     if config.peers.key_file:
         try:
@@ -62,6 +62,9 @@ def of_files(config: Config) -> Iterable[Check]:
     elif len(config.swarm.members) > 1:
         grade: Grade = "warning" if config.peers.allow_unsigned else "failure"
         yield Check("key", grade, "there are other drones, and no key", "set peers.key_file")
+    if len(config.swarm.members) > 1 and not config.swarm.known_distances:
+        what = "no distance between two drones is known: no first map has a scale"
+        yield Check("swarm", "warning", what, "swarm.known_distances, the same on every drone")
     folder = config.map.directory
     if folder:
         there = Path(folder)
