@@ -92,6 +92,12 @@ def test_a_drone_that_is_not_there_is_named(recording: Path) -> None:
         open_camera(options, SENSOR, ManualClock())
 
 
+def test_what_is_no_drone_s_folder_is_said(recording: Path) -> None:
+    options = CameraOptions(source=f"recording:{recording}")
+    with pytest.raises(RecordingError, match=rf"^{recording}: is no drone of a recording"):
+        open_camera(options, SENSOR, ManualClock())
+
+
 def test_images_of_another_size_than_the_calibration_are_refused(recording: Path) -> None:
     other = Sensor(Camera(64, 48, 30.0, 30.0, 15.5, 11.5), Pose.identity(), 5.0)
     options = CameraOptions(source=f"recording:{recording}/mav0")

@@ -72,6 +72,8 @@ def read_drone_frames(folder: Path) -> tuple[FrameFile, ...]:
     Raises:
         RecordingError: the recording is broken or has no such drone.
     """
+    if not folder.name.startswith("mav"):
+        raise RecordingError(f"{folder}: is no drone of a recording; give DIRECTORY/mavN")
     recording = read_recording(folder.parent)
     try:
         return recording.drone(folder.name).frames
