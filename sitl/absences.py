@@ -35,9 +35,14 @@ class Absence:
         if not 0.0 <= self.from_s < self.until_s:
             raise ConfigError(f"{self}: must be started after it is killed, {_KILL_LIKE}")
 
+    @property
+    def is_late(self) -> bool:
+        """Whether the daemon is not there from the start, but comes later."""
+        return self.from_s == 0.0
+
     def __str__(self) -> str:
         """Return the option that says so."""
-        if self.from_s == 0.0:
+        if self.is_late:
             return f"--late {self.drone}={self.until_s:g}"
         until = "" if math.isinf(self.until_s) else f"-{self.until_s:g}"
         return f"--kill {self.drone}={self.from_s:g}{until}"
@@ -69,6 +74,11 @@ class Blindness:
     def has(self, drone: str, at_s: float) -> bool:
         """Return whether a drone's frame of that second is not given."""
         return drone == self.drone and self.from_s <= at_s < self.until_s
+
+
+def seconds_late(absences: Sequence[Absence]) -> dict[str, float]:
+    """Return which drones' daemons come later than the start, and in which second."""
+    return {absence.drone: absence.until_s for absence in absences if absence.is_late}
 
 
 def parse_late(text: str) -> Absence:
@@ -132,7 +142,7 @@ def check_absences(absences: Sequence[Absence], names: Sequence[str], duration_s
         duration_s: of the flight.
     """
     check_times(absences, names, duration_s)
-    if {absence.drone for absence in absences if absence.from_s == 0.0} >= set(names):
+    if seconds_late(absences).keys() >= set(names):
         raise ConfigError("--late: nobody is there from the start")
 
 

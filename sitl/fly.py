@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from sitl.absences import seconds_late
 from sitl.daemon_config import check_settings
 from sitl.out_folder import prepare_folder
 from sitl.pacing import Instant, Pace, gate, instants
@@ -161,7 +162,7 @@ async def _play(
     flat_out = math.isinf(speed)
     frames_at_ns = [drone.frames_at_ns for drone in plan.drones]
     moments = instants(frames_at_ns, flat_out)
-    late = {absence.drone for absence in plan.options.absences if absence.from_s == 0.0}
+    late = seconds_late(plan.options.absences)
     there = {n for n, drone in enumerate(plan.drones) if drone.name not in late}
     holds_after = gate(moments, there)
     n_frames = sum(map(len, frames_at_ns))

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.absences import Absence, Blindness, check_absences, check_times
+from sitl.absences import Absence, Blindness, check_absences, check_times, seconds_late
 from sitl.firmware import FirmwareBinary
 from sitl.mission import Mission
 from sitl.network import NetworkOptions
@@ -258,7 +258,7 @@ def _known_pairs(
         if sum({pair.a, pair.b} == {other.a, other.b} for other in given) > 1:
             raise ConfigError(f"--known-distance {pair.a}:{pair.b}: is given twice")
     pairs = given or [p for p in recording.known_distances if {p.a, p.b} <= set(names)]
-    late = {absence.drone for absence in absences if absence.from_s == 0.0}
+    late = seconds_late(absences).keys()
     if not given and any({p.a, p.b} & late for p in pairs):
         # How far who comes late is away then nobody has measured.
         there = [d.name for d in drones if d.name not in late and d.drone.truth is not None][:2]
@@ -311,11 +311,11 @@ def _all_there_ns(
     drones: Sequence[PlannedDrone], pair: KnownPair, absences: Sequence[Absence]
 ) -> int:
     """Return when a first map can be made whose scale a pair gives: the recording waits for it."""
-    late_s = {absence.drone: absence.until_s for absence in absences if absence.from_s == 0.0}
+    late = seconds_late(absences)
     first_ns = {drone.name: int(drone.frames_at_ns[0]) for drone in drones}
-    needed = [name for name in first_ns if name not in late_s or name in (pair.a, pair.b)]
+    needed = [name for name in first_ns if name not in late or name in (pair.a, pair.b)]
     begins_ns = min(first_ns.values())
-    return max(max(first_ns[n], begins_ns + round(late_s.get(n, 0.0) * 1e9)) for n in needed)
+    return max(max(first_ns[n], begins_ns + round(late.get(n, 0.0) * 1e9)) for n in needed)
 
 
 def _true_distance_m(a: PlannedDrone, b: PlannedDrone, at_ns: int) -> float | None:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import sitl
+from sitl.absences import seconds_late
 from sitl.daemon_config import daemon_config, key_path, toml_text
 from sitl.frame_server import FrameServer
 from sitl.lives import Life, Lives, log_path, write_lives
@@ -114,7 +115,7 @@ class Swarm:
             )  # fmt: skip
             path = self._run_folder(drone.planned) / "daemon.toml"
             path.write_text(toml_text(config), encoding="utf-8")
-        late = {a.drone for a in self._plan.options.absences if a.from_s == 0.0}
+        late = seconds_late(self._plan.options.absences)
         there = [drone for drone in self.drones if drone.planned.name not in late]
         for drone in there:
             await self._start_daemon(drone, self._plan.starts_at_ns)
