@@ -240,10 +240,8 @@ class MapRounds:
         lacking = ""
         if isinstance(frames, list):
             lacking = lacks({f.drone_id: f.ned_from_body for f in frames}, origin)
-        if lacking:
-            built: LandmarkMap | NoMap = NoMap(lacking)
-        else:
-            built = await self._built(frames, lambda frames: self._work.first_map(frames, origin))
+            frames = NoMap(lacking) if lacking else frames
+        built = await self._built(frames, lambda frames: self._work.first_map(frames, origin))
         if not self._has_map():
             await self._decide(built, None, request_id)
         if lacking:  # and will for a while: before take-off, for minutes

@@ -106,7 +106,6 @@ class AutopilotLink:
         for told in self._told_firmware:
             told.firmware = self._firmware
         self._mode = VehicleMode()
-        self._link = options.link
         self._silent_s = 0.0
 
     @property
@@ -332,7 +331,7 @@ class AutopilotLink:
                     "are autopilot.link and system_id right?",
                     self._system_id,
                     _SILENT_S,
-                    self._link,
+                    self.options.link,
                 )
 
     def _ask_for_time(self, now_ns: int) -> None:

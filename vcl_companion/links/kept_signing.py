@@ -58,7 +58,9 @@ class KeptSigning:
             try:
                 key = read_key_file(Path(key_file))
             except ConfigError as error:
-                raise ConfigError(f"[peers] key_file: {error}") from error
+                is_missing = isinstance(error.__cause__, FileNotFoundError)
+                advice = "; `vcl keys install` puts a key there" if is_missing else ""
+                raise ConfigError(f"[peers] key_file: {error}{advice}") from error
             if timestamp_file:
                 self._file = TimestampFile(Path(timestamp_file))
                 left = self._file.read()

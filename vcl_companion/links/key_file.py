@@ -69,8 +69,6 @@ def read_passphrase(path: Path) -> str:
                     "key if somebody may have read it"
                 )
             text = file.read(_MAX_FILE_BYTES + 1).decode("ascii", errors="replace").strip()
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path}: {_why(error)}; `vcl keys install` puts a key there") from error
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: {_why(error)}") from error
     if not _PASSPHRASE.fullmatch(text):

@@ -189,9 +189,8 @@ class PairEvidence:
         if inverse is None:
             return np.full((6, 6), np.inf)
         through = -inverse @ self._by_host(pose, chosen)
-        shared = -inverse @ self._by_keyframes(pose, chosen)
+        shared, by_lens = (-inverse @ by for by in self._by_map_and_lens(pose, chosen))
         keyframes = self.index.uncertainty.keyframe_covariance
-        by_lens = -inverse @ self._by_lens(pose, chosen)
         of_matches = no_less_than(
             inverse + shared @ keyframes @ shared.T + by_lens @ by_lens.T,
             self._jackknife(pose, chosen),
@@ -253,20 +252,22 @@ class PairEvidence:
         moved = self._epipolar_px([self._target_from_host(pose, h) for h in hosts], chosen.epipolar)
         return np.asarray((by_pose * weight[:, None]).T @ ((moved - error) / _STEP).T)
 
-    def _by_keyframes(self, pose: Pose, chosen: Agreement) -> Array:
-        """Return (6, 6V) how the right side goes with the map's keyframes, by their landmarks."""
-        weighted, _, _, j_point = self._places(pose, chosen.landmark, self._sigma_px(pose))
-        levers = self.index.uncertainty.landmark_lever[self.landmarks[chosen.landmark]]
-        by_point = weighted @ j_point
-        return np.asarray(np.tensordot(by_point, levers, axes=((0, 2), (0, 1))))
+    def _by_map_and_lens(self, pose: Pose, chosen: Agreement) -> tuple[Array, Array]:
+        """Return how the right side goes, by its landmarks, with what these are found by.
 
-    def _by_lens(self, pose: Pose, chosen: Agreement) -> Array:
-        """Return (6, 7) how the right side goes with the target's lens, by its landmarks."""
-        camera, of_landmarks = self.target.camera, chosen.landmark
-        weighted, _, _, _ = self._places(pose, of_landmarks, self._sigma_px(pose))
+        Returns:
+            (6, 6V) with the map's keyframes, and (6, 7) with the target's lens.
+        """
+        of_landmarks, uncertainty = chosen.landmark, self.index.uncertainty
+        weighted, _, _, j_point = self._places(pose, of_landmarks, self._sigma_px(pose))
+        levers = uncertainty.landmark_lever[self.landmarks[of_landmarks]]
+        camera = self.target.camera
         pixels = camera.pixels_from_ideal(self.ideal_target[of_landmarks])
-        off_px = lens_px(camera, pixels, self.index.uncertainty.calibration_px)
-        return np.asarray(np.tensordot(weighted, off_px, axes=((0, 2), (0, 1))))
+        off_px = lens_px(camera, pixels, uncertainty.calibration_px)
+        return (
+            np.asarray(np.tensordot(weighted @ j_point, levers, axes=((0, 2), (0, 1)))),
+            np.asarray(np.tensordot(weighted, off_px, axes=((0, 2), (0, 1)))),
+        )
 
     def _lines(
         self, pose: Pose, chosen: NDArray[np.bool_], sigma_px: Array
