@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import signal
+import sys
 
 import click
 
@@ -10,22 +11,18 @@ from sitl.commands.flying import fly, live
 from sitl.commands.measuring import bench, consistency, paper, scale, torture
 from sitl.commands.recordings import import_, render
 from vcl_companion.errors import VclError
+from vcl_companion.one_line import OneLineGroup
 
 
-class _Commands(click.Group):
+class _Commands(OneLineGroup):
     """A group whose failures are one line: 2 for bad input, 1 for a flight that broke off."""
 
-    def invoke(self, ctx: click.Context) -> Any:
+    speaker = "sitl"
+
+    def status_of(self, error: VclError) -> int:
         from sitl.processes import FlightError
 
-        try:
-            return super().invoke(ctx)
-        except VclError as error:
-            click.echo(f"sitl: {' '.join(str(error).split())}", err=True)
-            ctx.exit(1 if isinstance(error, FlightError) else 2)
-        except KeyboardInterrupt:
-            click.echo("sitl: interrupted", err=True)
-            ctx.exit(130)
+        return 1 if isinstance(error, FlightError) else 2
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -37,4 +34,6 @@ for command in (fly, live, render, paper, bench, torture, scale, consistency, im
     main.add_command(command)
 
 if __name__ == "__main__":
+    # As Ctrl-C does: through every ``finally``, which clears what is half made.
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     main(prog_name="python -m sitl")

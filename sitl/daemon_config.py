@@ -23,6 +23,11 @@ TRUE_DISTANCE_SIGMA_M = 0.001
 # Autopilots in simulation have the cameras' clock. What is left are the steps in which their
 # estimators take poses in: anywhere within 10 ms (ArduPilot's EKF3).
 _TRUE_TIME_ERROR_S = 0.003
+# What the harness tells each daemon so that they find each other, it, and their own files.
+_OWN_TO_EACH = frozenset({
+    ("system_id",), ("camera", "source"), ("autopilot", "link"), ("peers", "listen"),
+    ("peers", "to"), ("log", "flight_log"), ("log", "status_file"), ("map", "directory"),
+})  # fmt: skip
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -81,8 +86,12 @@ def check_settings(plan: FlightPlan) -> None:
     """Refuse what no daemon would start with, before anything is written for one.
 
     Raises:
-        ConfigError: a setting, or a known distance, is no valid configuration.
+        ConfigError: a setting, or a known distance, is no valid configuration, or a setting
+            is another with each daemon.
     """
+    for setting in plan.options.settings:
+        if setting.path in _OWN_TO_EACH:
+            raise ConfigError(f"--set {'.'.join(setting.path)}: each daemon is given its own")
     for planned in plan.drones:
         others = range(2, 1 + len(plan.drones))
         config = daemon_config(plan, planned, Path("out"), 1, 1, 1, others)

@@ -51,6 +51,27 @@ def test_a_missing_configuration_names_the_file(tmp_path: Path) -> None:
     assert "none.toml: No such file" in result.output
 
 
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ("run", "vcl: Missing option '--config' (see main run --help)"),
+        ("rum", "vcl: No such command 'rum'. Did you mean 'run'? (see main --help)"),
+        ("--loud", "vcl: No such option '--loud' (see main --help)"),
+        ("keys new", "vcl: Missing argument 'FILE' (see main keys new --help)"),
+    ],
+)
+def test_a_command_that_is_wrong_is_one_line_and_status_2(arguments: str, line: str) -> None:
+    result = CliRunner().invoke(main, arguments.split())
+    assert (result.exit_code, result.stdout, result.stderr) == (2, "", f"{line}\n")
+
+
+def test_a_group_without_a_command_is_its_help() -> None:
+    result = CliRunner().invoke(main, ["keys"])
+    assert result.exit_code == 2
+    assert "install" in result.output
+    assert "Make, install and look at the key" in result.output
+
+
 def test_ctrl_c_is_one_line_and_status_130() -> None:
     # Who runs the tests in the background may have them ignore it.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)

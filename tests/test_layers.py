@@ -24,7 +24,7 @@ SHELVES = (
     ("swarm",),
     ("recording",),
     ("cameras", "links"),
-    ("config",),
+    ("config", "one_line"),
     ("daemon", "ground"),
     ("cli",),
 )

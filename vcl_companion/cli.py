@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from vcl_companion.errors import ConfigError, VclError
+from vcl_companion.one_line import OneLineGroup, tell
 
 if TYPE_CHECKING:
     from vcl_companion.config import LogOptions
@@ -27,24 +28,6 @@ _JOURNAL_PRIORITIES = {
     logging.ERROR: 3,
     logging.CRITICAL: 2,
 }
-
-
-class _Commands(click.Group):
-    """A group whose expected failures are one line and exit status 2, never a traceback."""
-
-    def invoke(self, ctx: click.Context) -> Any:
-        try:
-            return super().invoke(ctx)
-        except VclError as error:
-            _tell(error)
-            ctx.exit(2)
-        except KeyboardInterrupt:
-            click.echo("vcl: interrupted", err=True)
-            ctx.exit(130)
-
-
-def _tell(error: VclError) -> None:
-    click.echo(f"vcl: {' '.join(str(error).split())}", err=True)
 
 
 class _JournalFormatter(logging.Formatter):
@@ -79,7 +62,7 @@ def set_up_logging(options: LogOptions) -> None:
     logging.basicConfig(level=options.level.upper(), handlers=[handler], force=True)
 
 
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=OneLineGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="vcl-companion", prog_name="vcl")
 def main() -> None:
     """Collaborative visual localization for drones, as a MAVLink companion service."""
@@ -104,7 +87,7 @@ def run(config_path: Path) -> None:
     try:
         status = run_daemon(config)
     except VclError as error:
-        _tell(error)
+        tell("vcl", str(error))
         status = 2
     # A worker may still be deep in OpenCV. The interpreter, ending, would cut its thread
     # off there, which C++ answers with an abort; everything is closed and flushed by now.

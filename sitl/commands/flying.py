@@ -19,10 +19,6 @@ from sitl.commands.options import (
 from vcl_companion.errors import ConfigError
 
 
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())
-
-
 @click.command()
 @click.argument("recording", metavar="[RECORDING]", default="demo", type=FOLDER)
 @click.option("--out", required=True, metavar="DIR", type=FOLDER, help="Results; made if absent.")
@@ -111,7 +107,7 @@ def fly(
     autopilot: str | None,
     parameters: tuple[str, ...],
     speed: float,
-    drones: str,
+    drones: tuple[str, ...],
     distances: tuple[str, ...],
     attitude: Path | None,
     seed: int,
@@ -162,7 +158,7 @@ def fly(
         speed=speed,
         attitude=attitude,
         known_distances=tuple(map(parse_known_distance, distances)),
-        drones=_names(drones),
+        drones=drones,
         start_timeout_s=start_timeout,
         settings=(
             *map(parse_setting, settings),
@@ -222,7 +218,7 @@ def live(
     autopilot: str,
     parameters: tuple[str, ...],
     speed: float,
-    drones: str,
+    drones: tuple[str, ...],
     map_of: Path | None,
     start_timeout: float,
     blind: tuple[str, ...],
@@ -245,7 +241,7 @@ def live(
 
     options = FlyOptions(
         speed=speed,
-        drones=_names(drones),
+        drones=drones,
         start_timeout_s=start_timeout,
         settings=tuple(map(parse_setting, settings)),
         blind=tuple(map(parse_blind, blind)),

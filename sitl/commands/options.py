@@ -44,8 +44,21 @@ speed_option = click.option(
     help="Seconds of the flight per second, or max: as fast as all daemons keep up, their maps "
     "included.",
 )
+
+
+def _names(_: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
+    """Return the names between commas; none when it was not given."""
+    names = tuple(name.strip() for name in (value or "").split(",") if name.strip())
+    if value is not None and not names:
+        raise click.BadParameter(f"{value!r} names nobody", param=param)
+    return names
+
+
 drones_option = click.option(
-    "--drones", default="", metavar="mav0,mav1", help="Only these fly; otherwise all of them."
+    "--drones",
+    metavar="mav0,mav1",
+    callback=_names,
+    help="Only these fly; otherwise all of them.",
 )
 blind_option = click.option(
     "--blind",

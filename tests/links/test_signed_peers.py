@@ -146,6 +146,32 @@ def test_a_drone_with_another_key_is_a_stranger(
     }
 
 
+def test_another_drone_of_our_name_is_told_apart_from_an_echo(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def scenario() -> None:
+        swarm = Swarm(tmp_path, 2)
+        async with swarm.attacked(Clocks()) as (one, attacker):
+            echo, _ = await attacker.got.get()
+            for data in (echo, signed.frame(NOON + 1 * S, secret=SECRET, system=1)):
+                swarm.attack(attacker, data)
+            await counted(one, "of another with our system id")
+            while not caplog.records:
+                await asyncio.sleep(0.01)
+            assert one.link.counters.refused == {
+                "own echo": 1,
+                "of another with our system id": 1,
+            }
+            assert one.beats.empty()
+
+    caplog.set_level(logging.WARNING)
+    asyncio.run(scenario())
+    assert [record.getMessage() for record in caplog.records] == [
+        "peers: a frame was refused: of another with our system id "
+        "(is there another drone with this system_id?)"
+    ]
+
+
 def test_a_drone_without_a_clock_learns_the_time_and_is_heard(tmp_path: Path) -> None:
     async def scenario() -> None:
         swarm = Swarm(tmp_path, 2)

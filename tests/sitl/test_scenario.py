@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -203,6 +207,19 @@ def test_a_rendered_scenario_reads_back_and_is_the_same_every_time(tmp_path: Pat
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
     with pytest.raises(RecordingError, match="already there"):
         render_scenario(scenario, tmp_path / "one")
+
+
+def test_a_rendering_that_is_ended_leaves_nothing(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "sitl", "render", "demo", "--out", str(tmp_path / "demo")]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as rendering:
+        while not list(tmp_path.glob(".demo.*/mav0/cam0/data/*")):
+            assert rendering.poll() is None
+            time.sleep(0.02)
+        rendering.terminate()
+        _, errors = rendering.communicate()
+    assert rendering.returncode == 128 + signal.SIGTERM
+    assert "Traceback" not in errors
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.fixture(scope="module")

@@ -45,6 +45,7 @@ from vcl_companion.links.readers import READERS, TIMESYNC_LAYOUT
 from vcl_companion.links.signing import (
     AHEAD,
     BEHIND,
+    NOT_OURS,
     SIGNED_FLAG,
     TRAILER_BYTES,
     Signing,
@@ -166,7 +167,7 @@ class Codec:
             # It holds a key. Ours come from a file, and others' are not for anybody to see.
             self._tally.refuse("a key by radio")
             return None, True
-        refusal = self._signing.refusal(frame, self._now()) if self._signing else None
+        refusal = self._refusal(self._signing, frame) if self._signing else None
         if refusal is not None:
             self._tally.refuse(refusal)
             untimely = refusal in (AHEAD, BEHIND)
@@ -176,6 +177,13 @@ class Codec:
             self._tally.refuse(message)
             return None, True
         return message, True
+
+    def _refusal(self, signing: Signing, frame: bytes) -> str | None:
+        refusal = signing.refusal(frame, self._now())
+        in_our_name = (frame[5], frame[6]) == (self._mav.srcSystem, self._mav.srcComponent)
+        if refusal is None and in_our_name and signing.is_of_another(frame):
+            return NOT_OURS
+        return refusal
 
     def _read(self, frame: bytes, message_id: int) -> Message | str | None:
         """Return a frame's message, why it is refused, or None when nobody wants it."""

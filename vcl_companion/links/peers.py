@@ -24,7 +24,15 @@ from vcl_companion.links.messages import (
     Untimely,
 )
 from vcl_companion.links.reconnect import Address
-from vcl_companion.links.signing import AHEAD, BEHIND, FORGED, NO_KEY, UNSIGNED, SigningOptions
+from vcl_companion.links.signing import (
+    AHEAD,
+    BEHIND,
+    FORGED,
+    NO_KEY,
+    NOT_OURS,
+    UNSIGNED,
+    SigningOptions,
+)
 from vcl_companion.links.transport import open_peer_socket, parse_peers
 from vcl_companion.swarm.pace import FULL_PACE_S, stretch_of
 
@@ -43,6 +51,7 @@ _TELLING = {
     UNSIGNED: "is a drone without a key?",
     FORGED: "is the key the same on every drone?",
     NO_KEY: "has this drone no key?",
+    NOT_OURS: "is there another drone with this system_id?",
     AHEAD: "a drone's clock is ahead of ours",
     BEHIND: "a drone's clock is behind ours",
 }

@@ -47,6 +47,7 @@ UNSIGNED: Final = "not signed"
 FORGED: Final = "wrong signature"
 REPLAYED: Final = "replayed"
 NO_KEY: Final = "no key to verify with"
+NOT_OURS: Final = "of another with our system id"
 
 _SIGNATURE_BYTES = 6
 _RADIO_STATUS_ID = 109
@@ -193,6 +194,13 @@ class Signing:
                 return "too many streams"
             heard = self._heard[stream] = _Heard(timestamp - self._overtaking)
         return None if heard.takes(timestamp, self._overtaking) else REPLAYED
+
+    def is_of_another(self, frame: bytes) -> bool:
+        """Whether a frame that was taken, in our name, is younger than all that we have signed.
+
+        Of two who have one name it is told to the one whose time is behind, sooner or later.
+        """
+        return bool(frame[2] & SIGNED_FLAG) and timestamp_of(frame) > self.time.latest
 
     def marks(self, now: Moment) -> dict[Stream, int]:
         """Return the latest timestamp of each stream that is not too old to matter."""

@@ -83,6 +83,11 @@ class SwarmTime:
             return wall
         return running
 
+    @property
+    def latest(self) -> int:
+        """The time of the latest frame that was sent; before the first where time began."""
+        return self._last
+
     def next(self, now: Moment) -> int:
         """Return the time for a frame that is sent now; it rises with every frame."""
         self._last = max(self._last + 1, self.at(now))
