@@ -63,8 +63,7 @@ def join_together(
         chosen = graph[pair].chosen
         if not isinstance(chosen, RelativePose):
             continue
-        matches = {p: edge.matches for p, edge in graph.items()}
-        scene, tracks = grown_from(views, pair, chosen.b_from_a, matches, options)
+        scene, tracks = grown_from(views, pair, chosen.b_from_a, graph, options)
         placed = _placed(views, links, scene, tracks, known, sure, options, seed)
         if not isinstance(placed, NoMap):
             return placed

@@ -90,8 +90,7 @@ def _build(
     options: MapOptions,
 ) -> LandmarkMap | NoMap:
     """Grow a scene from the seed pair, make it metric."""
-    matches = {p: edge.matches for p, edge in graph.items()}
-    scene, tracks = grown_from(drones, pair, chosen.b_from_a, matches, options)
+    scene, tracks = grown_from(drones, pair, chosen.b_from_a, graph, options)
     observed = pixels_of_tracks(tracks, [d.pixels for d in drones])
     made = metric(drones, scene, observed, distances_m, options)
     if isinstance(made, NoMap):

@@ -9,23 +9,28 @@ from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.mapping.baseline import with_length
 from vcl_companion.mapping.culling import decisive, fitting, placed
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.tracks import (
-    PairMatches,
     ideal_of_pixels,
     join_tracks,
     pixels_of_tracks,
     slopes_of_ideal,
 )
+from vcl_companion.mapping.visibility import Edge
 from vcl_companion.vision.bundle import (
     BundleOptions,
     Distance,
     Views,
     adjust,
 )
+from vcl_companion.vision.essential import RelativePose
 from vcl_companion.vision.resection import NotFound, ResectionOptions, Sightings, refine, search
+
+# Before poses are adjusted what is right may miss by so many times as much.
+_LOOSE = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +53,7 @@ def grown_from(
     drones: list[DroneView],
     pair: tuple[int, int],
     b_from_a: Pose,
-    matches: dict[tuple[int, int], PairMatches],
+    graph: dict[tuple[int, int], Edge],
     options: MapOptions,
 ) -> tuple[Scene, NDArray[np.intp]]:
     """Triangulate a seed pair, register view after view, adjust each time.
@@ -57,13 +62,14 @@ def grown_from(
         drones: all views.
         pair: the seed, two of them.
         b_from_a: the relative pose of its cameras.
-        matches: that agree, of all pairs of views.
+        graph: what pairs of views have in common.
         options: thresholds.
 
     Returns:
         The scene with the views that could be registered, and the (N, V) tracks
         its landmarks are: feature of each view, -1 where unseen.
     """
+    matches = {p: edge.matches for p, edge in graph.items()}
     tracks = join_tracks([len(d.pixels) for d in drones], matches)
     cameras = [d.camera for d in drones]
     ideal = ideal_of_pixels(pixels_of_tracks(tracks, [d.pixels for d in drones]), cameras)
@@ -74,7 +80,10 @@ def grown_from(
         {pair[0]: Pose.identity(), pair[1]: b_from_a.inverse()},
     )
     scene = adjusted(start, options)
-    while (extended := register_next(drones, scene, options)) is not None:
+    while True:
+        extended = register_next(drones, scene) or register_by_pair(drones, scene, graph, options)
+        if extended is None:
+            break
         scene = adjusted(extended, options)
     return scene, tracks
 
@@ -83,7 +92,7 @@ def adjusted(scene: Scene, options: MapOptions) -> Scene:
     """Triangulate all that registered views see, adjust, drop what does not fit; twice."""
     used = sorted(scene.cams)
     ideal = scene.ideal.copy()
-    for limit_px in (3.0 * options.max_error_px, options.max_error_px):
+    for limit_px in (_LOOSE * options.max_error_px, options.max_error_px):
         points = placed([scene.cams[i] for i in used], ideal[:, used])
         scene = replace(scene, points=points, ideal=ideal)
         ideal, good = _culled(scene, limit_px, options)
@@ -135,7 +144,7 @@ def _culled(scene: Scene, limit_px: float, options: MapOptions) -> tuple[Array, 
     return ideal, good
 
 
-def register_next(drones: list[DroneView], scene: Scene, options: MapOptions) -> Scene | None:
+def register_next(drones: list[DroneView], scene: Scene) -> Scene | None:
     """Register the waiting view that sees most of what is placed; None when none can be."""
     known = np.isfinite(scene.points[:, 0])
     waiting = [i for i in range(len(drones)) if i not in scene.cams]
@@ -161,4 +170,36 @@ def register_next(drones: list[DroneView], scene: Scene, options: MapOptions) ->
             ideal = scene.ideal.copy()
             ideal[index[~found.inliers], i] = np.nan
             return replace(scene, ideal=ideal, cams={**scene.cams, i: found.world_from_body})
+    return None
+
+
+def register_by_pair(
+    drones: list[DroneView],
+    scene: Scene,
+    graph: dict[tuple[int, int], Edge],
+    options: MapOptions,
+) -> Scene | None:
+    """Register the waiting view that shares most with a registered one; None when none can be."""
+    known = np.isfinite(scene.points[:, 0])
+    for i, k in sorted(graph, key=lambda p: len(graph[p].matches.a), reverse=True):
+        chosen = graph[i, k].chosen
+        if (i in scene.cams) == (k in scene.cams) or not isinstance(chosen, RelativePose):
+            continue
+        a, b, b_from_a = (
+            (i, k, chosen.b_from_a) if i in scene.cams else (k, i, chosen.b_from_a.inverse())
+        )
+        index = np.flatnonzero(known & np.isfinite(scene.ideal[:, b, 0]))
+        found = with_length(
+            b_from_a,
+            scene.cams[a].inverse().apply(scene.points[index]),
+            scene.ideal[index, b],
+            drones[b].camera.focal_px,
+            _LOOSE * options.max_error_px,
+        )
+        if isinstance(found, NotFound):
+            continue
+        pose, agree = found
+        ideal = scene.ideal.copy()
+        ideal[index[~agree], b] = np.nan
+        return replace(scene, ideal=ideal, cams={**scene.cams, b: scene.cams[a] @ pose.inverse()})
     return None

@@ -1,0 +1,98 @@
+"""A third drone that shares much with one other, and hardly a landmark with both."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.checks import assert_consistent
+from tests.mapping.views import drone_views, world_from_scene
+from tests.scenes import Scene, facade_scene
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.mapping.baseline import with_length
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.options import MapOptions
+from vcl_companion.mapping.reconstruction import reconstruct
+from vcl_companion.mapping.uncertainty import map_uncertainty
+from vcl_companion.vision.resection import NotFound
+
+OPTIONS = MapOptions(detectors=("akaze",))
+N_SEEN = 150
+
+
+def chained(rng: np.random.Generator, n_common: int, outliers: float = 0.0) -> Scene:
+    """Return a scene of which the second drone sees the first half and the third the other."""
+    scene = facade_scene(
+        rng, 2 * N_SEEN - n_common, n_views=3, noise_px=0.3, outliers=outliers, turn_deg=2.0
+    )
+    observed = scene.observed_px.copy()
+    observed[N_SEEN:, 1] = np.nan
+    observed[: N_SEEN - n_common, 2] = np.nan
+    return replace(scene, observed_px=observed)
+
+
+def first_map(rng: np.random.Generator, scene: Scene) -> LandmarkMap:
+    views = drone_views(rng, scene, [1, 2, 3], attitude_sigma_rad=0.02)
+    made = reconstruct(views, 1, [(1, 2, scene.baseline_m(0, 1))], OPTIONS)
+    assert isinstance(made, LandmarkMap), made
+    return made
+
+
+def test_a_drone_chained_to_another_by_few_landmarks_errs_as_much_as_stated() -> None:
+    off, told = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        scene = chained(rng, 14, outliers=0.05)
+        made = first_map(rng, scene)
+        assert [k.drone_id for k in made.keyframes] == [1, 2, 3]
+        third = made.keyframes[2].world_from_body
+        off.append(third.local(world_from_scene() @ scene.bodies[2]))
+        told.append(map_uncertainty(made).keyframe_covariance[12:18, 12:18])
+    assert_consistent(np.array(off), np.array(told))
+
+
+def test_a_drone_that_shares_too_few_landmarks_with_two_others_is_left_out() -> None:
+    rng = np.random.default_rng(0)
+    made = first_map(rng, chained(rng, 4))
+    assert [k.drone_id for k in made.keyframes] == [1, 2]
+
+
+@pytest.mark.parametrize("n_wrong", [0, 8])
+def test_the_length_is_that_of_most_landmarks(n_wrong: int) -> None:
+    rng = np.random.default_rng(1)
+    scene = facade_scene(rng, 20, noise_px=0.2)
+    a, b = scene.worlds_from_cams
+    b_from_a = b.inverse() @ a
+    length = float(np.linalg.norm(b_from_a.translation))
+    points = a.inverse().apply(scene.points_world)
+    points[:n_wrong] *= rng.uniform(1.5, 3.0, (n_wrong, 1))
+    both = scene.seen.all(axis=1)
+    found = with_length(
+        Pose(b_from_a.rotation, b_from_a.translation / length),
+        points[both],
+        scene.ideal[both, 1],
+        scene.camera.focal_px,
+        3.0,
+    )
+    assert not isinstance(found, NotFound)
+    pose, agree = found
+    assert np.linalg.norm(pose.translation) == pytest.approx(length, rel=0.01)
+    np.testing.assert_allclose(pose.rotation, b_from_a.rotation)
+    np.testing.assert_array_equal(agree, np.arange(len(both))[both] >= n_wrong)
+
+
+def test_landmarks_that_contradict_each_other_give_no_length() -> None:
+    rng = np.random.default_rng(2)
+    points = rng.uniform([-3.0, -2.0, 4.0], [3.0, 2.0, 40.0], (20, 3))
+    found = with_length(
+        Pose(np.eye(3), np.array([1.0, 0.0, 0.0])), points, rng.uniform(-1, 1, (20, 2)), 320.0, 3.0
+    )
+    assert isinstance(found, NotFound)
+    assert "agree on how long" in found.reason
+    few = with_length(
+        Pose(np.eye(3), np.array([1.0, 0.0, 0.0])), points[:5], np.zeros((5, 2)), 320.0, 3.0
+    )
+    assert isinstance(few, NotFound)
+    assert "6 needed" in few.reason
