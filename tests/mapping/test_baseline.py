@@ -10,12 +10,15 @@ import pytest
 from tests.checks import assert_consistent
 from tests.mapping.views import drone_views, world_from_scene
 from tests.scenes import Scene, facade_scene
+from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.mapping.baseline import with_length
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.reconstruction import reconstruct
 from vcl_companion.mapping.uncertainty import map_uncertainty
+from vcl_companion.mapping.update import extended
+from vcl_companion.vision.features import Detector, Features
 from vcl_companion.vision.resection import NotFound
 
 OPTIONS = MapOptions(detectors=("akaze",))
@@ -75,24 +78,63 @@ def test_the_length_is_that_of_most_landmarks(n_wrong: int) -> None:
         scene.ideal[both, 1],
         scene.camera.focal_px,
         3.0,
+        0.1,
     )
     assert not isinstance(found, NotFound)
     pose, agree = found
     assert np.linalg.norm(pose.translation) == pytest.approx(length, rel=0.01)
     np.testing.assert_allclose(pose.rotation, b_from_a.rotation)
-    np.testing.assert_array_equal(agree, np.arange(len(both))[both] >= n_wrong)
+    np.testing.assert_array_equal(agree, np.flatnonzero(both) >= n_wrong)
 
 
 def test_landmarks_that_contradict_each_other_give_no_length() -> None:
     rng = np.random.default_rng(2)
+    aside = Pose(np.eye(3), np.array([1.0, 0.0, 0.0]))
     points = rng.uniform([-3.0, -2.0, 4.0], [3.0, 2.0, 40.0], (20, 3))
-    found = with_length(
-        Pose(np.eye(3), np.array([1.0, 0.0, 0.0])), points, rng.uniform(-1, 1, (20, 2)), 320.0, 3.0
-    )
+    found = with_length(aside, points, rng.uniform(-1, 1, (20, 2)), 320.0, 3.0, 0.1)
     assert isinstance(found, NotFound)
     assert "agree on how long" in found.reason
-    few = with_length(
-        Pose(np.eye(3), np.array([1.0, 0.0, 0.0])), points[:5], np.zeros((5, 2)), 320.0, 3.0
-    )
+    few = with_length(aside, points[:5], np.zeros((5, 2)), 320.0, 3.0, 0.1)
     assert isinstance(few, NotFound)
     assert "6 needed" in few.reason
+
+
+def test_a_length_that_landmarks_know_too_vaguely_is_none() -> None:
+    rng = np.random.default_rng(3)
+    aside = Pose(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    points = rng.uniform([-3.0, -2.0, 30.0], [3.0, 2.0, 40.0], (8, 3))
+    seen = (points + aside.translation)[:, :2] / points[:, 2:] + rng.normal(0.0, 0.01, (8, 2))
+    found = with_length(aside, points, seen, 320.0, 9.0, 0.05)
+    assert isinstance(found, NotFound)
+    assert "% only" in found.reason
+    assert not isinstance(with_length(aside, points, seen, 320.0, 9.0, 0.5), NotFound)
+
+
+def late(rng: np.random.Generator, n_common: int, outliers: float) -> tuple[Scene, LandmarkMap]:
+    """Return a scene, and the first two drones' map of it extended by the third's view."""
+    scene = chained(rng, n_common, outliers)
+    views = drone_views(rng, scene, [1, 2, 3], attitude_sigma_rad=0.02)
+    old = reconstruct(views[:2], 1, [(1, 2, scene.baseline_m(0, 1))], OPTIONS)
+    assert isinstance(old, LandmarkMap), old
+
+    def features_of(image_bytes: bytes, _: Camera, detector: Detector) -> Features:
+        assert detector == "akaze"
+        return next(v.features[0] for v in views if v.image_bytes == image_bytes)
+
+    made = extended(old, b"revision", views[2:], features_of, OPTIONS)
+    return scene, made if isinstance(made, LandmarkMap) else old
+
+
+def test_a_late_drone_is_chained_to_a_keyframe_and_errs_as_much_as_stated() -> None:
+    off, told = [], []
+    for seed in range(12):
+        scene, made = late(np.random.default_rng(seed), 14, 0.05)
+        assert [k.drone_id for k in made.keyframes] == [1, 2, 3]
+        off.append(made.keyframes[2].world_from_body.local(world_from_scene() @ scene.bodies[2]))
+        told.append(map_uncertainty(made).keyframe_covariance[12:18, 12:18])
+    assert_consistent(np.array(off), np.array(told))
+
+
+def test_a_late_drone_that_shares_hardly_a_landmark_is_left_out() -> None:
+    _, made = late(np.random.default_rng(0), 4, 0.0)
+    assert [k.drone_id for k in made.keyframes] == [1, 2]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.vision.information import robust_sigma
 from vcl_companion.vision.resection import NotFound
 
 Mask = NDArray[np.bool_]
@@ -24,7 +25,12 @@ _LEAST_SHARE = 0.5
 
 
 def with_length(
-    b_from_a: Pose, points_a: Array, ideal_b: Array, focal_px: float, limit_px: float
+    b_from_a: Pose,
+    points_a: Array,
+    ideal_b: Array,
+    focal_px: float,
+    limit_px: float,
+    max_error: float,
 ) -> tuple[Pose, Mask] | NotFound:
     """Give a relative pose its length.
 
@@ -34,6 +40,7 @@ def with_length(
         ideal_b: (M, 2) where camera b shows them, ideal image coordinates; wrong ones among them.
         focal_px: of camera b, px per ideal unit.
         limit_px: who agrees misses its landmark by no more.
+        max_error: how vague the length may be, as a share of it, 1 sigma.
 
     Returns:
         The pose in the landmarks' unit, and (M,) which of them agree; or why there is none.
@@ -55,6 +62,9 @@ def with_length(
     if n < max(_LEAST, _LEAST_SHARE * len(points_a)):
         return NotFound(f"{n} of {len(points_a)} landmarks agree on how long the baseline is")
     length = float(np.median(lengths[best]))
+    vague = robust_sigma(lengths[best] - length) / np.sqrt(n) / length
+    if vague > max_error:
+        return NotFound(f"{n} landmarks tell how long the baseline is to {100 * vague:.0f} % only")
     agreeing = _agree(length, b_from_a, turned, ideal_b, focal_px, limit_px)
     return Pose(b_from_a.rotation, length * b_from_a.translation), agreeing
 

@@ -17,6 +17,8 @@ from vcl_companion.vision.triangulation import ray_angles, triangulate
 
 Mask = NDArray[np.bool_]
 
+LOOSE = 3.0
+"""Poses of a registration are off by some pixels: by them what is right may miss so much more."""
 # A landmark that decides more than this of the poses is left out.
 _MAX_LEVERAGE = 0.25
 # Pixel noise that depths are judged by: an adjustment may find less by chance.

@@ -9,7 +9,7 @@ import numpy as np
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.culling import Mask, decisive, fitting, placed
+from vcl_companion.mapping.culling import LOOSE, Mask, decisive, fitting, placed
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.joining import Joined
 from vcl_companion.mapping.known_features import Index, KeyframeLibrary
@@ -24,8 +24,6 @@ from vcl_companion.mapping.tracks import (
 from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust
 from vcl_companion.vision.essential import sampson_px
 
-# Poses of the registration are off by some pixels; the adjusted ones are not.
-_LOOSE = 3.0
 # More of them move keyframes by less than half a millimetre.
 _FIRST_STEPS, _LAST_STEPS = 6, 12
 
@@ -92,7 +90,7 @@ def grown(
         ),
     )
     noise_px, good = old.pixel_noise_px, np.zeros(len(ideal), dtype=bool)
-    for factor, steps in ((_LOOSE, _FIRST_STEPS), (1.0, _LAST_STEPS)):
+    for factor, steps in ((LOOSE, _FIRST_STEPS), (1.0, _LAST_STEPS)):
         estimate, good, noise_px = _adjusted(
             estimate, n_old, factor * options.max_error_px, steps, options
         )
@@ -175,7 +173,7 @@ def _observed(
     for i in chosen:
         edges[0, column[i]] = joined[i].links
         linked[i][joined[i].links.b] = True
-    limit_px = _LOOSE * options.max_error_px
+    limit_px = LOOSE * options.max_error_px
     for (k, i), m in pairs.with_keyframes.items():
         if i in joined:
             keyframe = old.keyframes[k]

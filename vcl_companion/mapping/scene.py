@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.baseline import with_length
-from vcl_companion.mapping.culling import decisive, fitting, placed
+from vcl_companion.mapping.culling import LOOSE, decisive, fitting, placed
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.tracks import (
@@ -28,9 +28,6 @@ from vcl_companion.vision.bundle import (
 )
 from vcl_companion.vision.essential import RelativePose
 from vcl_companion.vision.resection import NotFound, ResectionOptions, Sightings, refine, search
-
-# Before poses are adjusted what is right may miss by so many times as much.
-_LOOSE = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +89,7 @@ def adjusted(scene: Scene, options: MapOptions) -> Scene:
     """Triangulate all that registered views see, adjust, drop what does not fit; twice."""
     used = sorted(scene.cams)
     ideal = scene.ideal.copy()
-    for limit_px in (_LOOSE * options.max_error_px, options.max_error_px):
+    for limit_px in (LOOSE * options.max_error_px, options.max_error_px):
         points = placed([scene.cams[i] for i in used], ideal[:, used])
         scene = replace(scene, points=points, ideal=ideal)
         ideal, good = _culled(scene, limit_px, options)
@@ -194,7 +191,8 @@ def register_by_pair(
             scene.cams[a].inverse().apply(scene.points[index]),
             scene.ideal[index, b],
             drones[b].camera.focal_px,
-            _LOOSE * options.max_error_px,
+            LOOSE * options.max_error_px,
+            options.max_depth_error,
         )
         if isinstance(found, NotFound):
             continue

@@ -13,6 +13,7 @@ import numpy as np
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
+from vcl_companion.mapping.chaining import join_to_keyframe
 from vcl_companion.mapping.continuity import broken_continuity, pruned
 from vcl_companion.mapping.correspondences import Correspondences, unique
 from vcl_companion.mapping.drone_view import DroneView
@@ -33,6 +34,8 @@ from vcl_companion.vision.features import Detector, FeatureOptions, Features, de
 
 # Keyframes that a view is matched with before it is given up.
 _TRIED = 6
+# Of these so many, of most matches, are tried by themselves.
+_PAIRED = 2
 # A new view has to see this many landmarks in the end.
 _MIN_SEEN = 20
 
@@ -239,6 +242,7 @@ class _Update:
         self._reasons: dict[int, str] = {}
         self._refuted: set[int] = set()
         self._grouped: set[int] = set()
+        self._paired: set[int] = set()
 
     def run(self) -> Growth | NoMap:
         """Register view after view until no more can be; drop those that the whole refutes."""
@@ -269,6 +273,8 @@ class _Update:
                 except ValueError as error:
                     return NoMap(str(error))
             if growth is not None and self._join_new(growth, known, sure):
+                continue
+            if self._join_pairs():
                 continue
             if not self._join_groups(growth, known, sure):
                 break
@@ -324,6 +330,27 @@ class _Update:
                 self._reasons[i] = one.reason
         self._take(growth, found)
         return bool(found)
+
+    def _join_pairs(self) -> bool:
+        """Register waiting views by one keyframe each, each view once; whether any was."""
+        some = False
+        for i in self._waiting():
+            if i in self._paired:
+                continue
+            self._paired.add(i)
+            tried = [k for k, mine in self._matches.pairs.with_keyframes if mine == i]
+            tried.sort(key=lambda k: -len(self._matches.with_keyframe(k, i).a))
+            for k in tried[:_PAIRED]:
+                found = join_to_keyframe(
+                    self._views[i], k, self._library.of(k), self._matches.with_keyframe(k, i),
+                    self._old, self._options, self._seed,
+                )  # fmt: skip
+                if isinstance(found, Joined):
+                    self._joined[i] = found
+                    some = True
+                    break
+                self._reasons[i] = found.reason
+        return some
 
     def _join_groups(self, growth: Growth | None, known: LandmarkMap, sure: MapUncertainty) -> bool:
         """Register waiting views of one drone jointly, each drone once; whether any was."""
