@@ -42,6 +42,8 @@ def join_to_keyframe(
     Returns:
         The pose, with the links to landmarks that agree; or why there is none.
     """
+    if len(matches.a) < options.min_landmarks:
+        return NotFound(f"{len(matches.a)} matches with a keyframe, {options.min_landmarks} needed")
     keyframe = known.keyframes[k]
     pair = [_as_view(keyframe, shown), view]
     edge = visibility_graph(pair, options, seed, {(0, 1): matches})[0, 1]
