@@ -288,7 +288,8 @@ class _Update:
         return self._joined[0].world_from_body if self._joined else None
 
     def _told(self) -> list[str]:
-        return [f"drone {self._views[i].drone_id}: {r}" for i, r in sorted(self._reasons.items())]
+        told = (f"drone {self._views[i].drone_id}: {r}" for i, r in sorted(self._reasons.items()))
+        return list(dict.fromkeys(told))
 
     def _join_old(self, i: int) -> None:
         """Register a view by landmarks of the old map."""
