@@ -30,7 +30,7 @@ from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.swarm.quarantine import QuarantineOptions
 from vcl_companion.swarm.transfer import Transfers
-from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.swarm.update_options import UpdateOptions
 from vcl_companion.vision.features import Detector, FeatureOptions
 
 DETECTORS: tuple[Detector, ...] = ("akaze",)

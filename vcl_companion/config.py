@@ -30,7 +30,7 @@ from vcl_companion.mapping.options import MapOptions
 from vcl_companion.swarm.group import SwarmOptions
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.swarm.transfer_options import TransferOptions
-from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.swarm.update_options import UpdateOptions
 from vcl_companion.vision.features import Detector, FeatureOptions
 
 _Section = TypeVar("_Section")

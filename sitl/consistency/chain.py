@@ -20,7 +20,7 @@ from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.recording import Drone, Recording
 from vcl_companion.recording.images import load_image
 from vcl_companion.swarm.pose_requests import InterMavOptions
-from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.swarm.update_options import UpdateOptions
 from vcl_companion.vision.features import FeatureOptions, Image
 from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.header import BlobKind
@@ -161,7 +161,7 @@ class Chain:
     def _is_wanted(self, look: Look) -> bool:
         """Whether a drone wants the map extended: it sees too little, or anew what it sees.
 
-        Of the reasons of ``swarm.updates`` coverage and vagueness do not count here.
+        Of the reasons of ``swarm.own_vote`` coverage and vagueness do not count here.
         """
         fix, i = look.fix, look.drone
         if fix is None:

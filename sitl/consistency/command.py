@@ -14,7 +14,7 @@ from sitl.consistency.report import Beginning, recording_report, write_consisten
 from sitl.result_folder import result_folder
 from vcl_companion.errors import ConfigError, RecordingError
 from vcl_companion.recording import Recording, read_recording
-from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.swarm.update_options import UpdateOptions
 from vcl_companion.vision.warm_up import warm_up
 
 Told = Callable[[str], None]

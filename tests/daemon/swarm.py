@@ -56,7 +56,7 @@ from vcl_companion.swarm.transfer import (
     TransferOptions,
     Transfers,
 )
-from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.swarm.update_options import UpdateOptions
 from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame
 from vcl_companion.wire.map_update import name_of_image

@@ -8,7 +8,7 @@ import pytest
 from tests.daemon import demo
 from tests.daemon.swarm import Drone, swarm
 from tests.daemon.waiting import computed, passes, passes_until, run, until
-from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.swarm.update_options import UpdateOptions
 
 UPDATE_MAP, SAVE, RELOAD, RELOCALIZE, PAUSE = range(31010, 31015)
 ACCEPTED, BUSY, DENIED, UNSUPPORTED, FAILED, IN_PROGRESS, CANCELLED = range(7)

@@ -12,7 +12,7 @@ from tests.daemon import demo
 from tests.daemon.swarm import Drone, swarm
 from tests.daemon.waiting import computed, passes, passes_until, run
 from vcl_companion.swarm.transfer import TransferOptions
-from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.swarm.update_options import UpdateOptions
 from vcl_companion.wire.map_codec import revision_of
 
 OLD = revision_of(demo.encoded_map(1, 2))

@@ -18,7 +18,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import matrix_from_euler
 from vcl_companion.mapping.landmark_map import Keyframe
 from vcl_companion.swarm.transfer import BlobKind
-from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.swarm.update_options import UpdateOptions
 from vcl_companion.wire.frame_codec import encode_frame
 from vcl_companion.wire.map_codec import decode_map, parent_of, revision_of
 from vcl_companion.wire.map_update import decode_map_update, encode_map_update

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tests.daemon.swarm import Drone, swarm
 from tests.daemon.waiting import passes, passes_until, run
-from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.swarm.update_options import UpdateOptions
 
 PLENTY = 500
 

@@ -20,7 +20,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.mapping.seen_landmarks import SeenLandmarks
 from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.transfer import BlobKind
-from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.swarm.update_options import UpdateOptions
 from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame, encode_frame
 from vcl_companion.wire.map_codec import decode_map, revision_of
 from vcl_companion.wire.map_update import decode_map_update, images_in_update, name_of_image

@@ -10,7 +10,7 @@ from tests.daemon.swarm import Drone, swarm
 from tests.daemon.waiting import passes, passes_until, run, until
 from tests.links import wire
 from vcl_companion.links.autopilot_options import AutopilotOptions
-from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.swarm.update_options import UpdateOptions
 
 REAL32 = 9
 DEFAULTS = {

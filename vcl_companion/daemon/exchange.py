@@ -50,7 +50,7 @@ from vcl_companion.swarm.pace import look_s
 from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
 from vcl_companion.swarm.quarantine import QuarantineOptions
 from vcl_companion.swarm.transfer import BlobKind, Transfers
-from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.swarm.update_options import UpdateOptions
 from vcl_companion.vision.features import Detector
 from vcl_companion.wire.messages import MapRefused
 

@@ -33,7 +33,8 @@ from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.reconstruction import lacks
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.pace import look_s
-from vcl_companion.swarm.updates import UpdateOptions, UpdateTrigger
+from vcl_companion.swarm.update_options import UpdateOptions
+from vcl_companion.swarm.update_trigger import UpdateTrigger
 from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.messages import FrameRequest
 

@@ -12,7 +12,8 @@ from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.localization.outlook import novelty_from
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.group import Group
-from vcl_companion.swarm.updates import OwnVote, Sight, UpdateOptions
+from vcl_companion.swarm.own_vote import OwnVote, Sight
+from vcl_companion.swarm.update_options import UpdateOptions
 from vcl_companion.wire.messages import MAX_TRACKED, MapState
 
 _INTERVAL_S = 1.0
