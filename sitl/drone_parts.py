@@ -21,7 +21,7 @@ from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
-from vcl_companion.localization.intra import LocalizationOptions
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.localization.tracking import TrackingOptions

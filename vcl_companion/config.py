@@ -22,7 +22,7 @@ from vcl_companion.cameras.source import CameraOptions
 from vcl_companion.errors import ConfigError
 from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.peers import PeerOptions
-from vcl_companion.localization.intra import LocalizationOptions
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.pipeline import Pipeline
 from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.localization.tracking import TrackingOptions

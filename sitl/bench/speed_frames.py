@@ -15,7 +15,8 @@ from sitl.bench.speed_scene import FEATURES, Scene, Shot
 from sitl.bench.timing import Effort, interleaved
 from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_offer import MapOffer, ReadyMap, ready_map
-from vcl_companion.localization.intra import LocalizationOptions, Localized, NotLocalized, Prior
+from vcl_companion.localization.fix import Localized, NotLocalized, Prior
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.pipeline import PipelineOptions, localize
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.mapping.landmark_map import LandmarkMap

@@ -14,7 +14,7 @@ from sitl.world import World
 from vcl_companion.errors import RecordingError
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.localization.intra import Prior
+from vcl_companion.localization.fix import Prior
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.keyframe_image import decode_image, encode_image

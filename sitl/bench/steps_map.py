@@ -13,13 +13,9 @@ from sitl.bench.inputs import FEATURES, Inputs
 from sitl.bench.timing import Accuracy, Entry
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, right_jacobian_so3
-from vcl_companion.localization.intra import (
-    LocalizationOptions,
-    Localized,
-    NotLocalized,
-    Prior,
-    localize_intra,
-)
+from vcl_companion.localization.fix import Localized, NotLocalized, Prior
+from vcl_companion.localization.intra import localize_intra
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.vision.bundle import (

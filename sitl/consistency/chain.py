@@ -13,7 +13,8 @@ from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import exp_so3, quaternion_from_matrix
 from vcl_companion.localization.detail import Detail, needed_detail
-from vcl_companion.localization.intra import LocalizationOptions, Localized, Prior
+from vcl_companion.localization.fix import Localized, Prior
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.tracking import TrackingOptions, track
 from vcl_companion.mapping.options import MapOptions, NoMap

@@ -25,7 +25,7 @@ from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.links.messages import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions, open_signing
-from vcl_companion.localization.intra import Localized
+from vcl_companion.localization.fix import Localized
 from vcl_companion.localization.pose_filter import FilterState
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.swarm.group import SwarmOptions

@@ -17,7 +17,7 @@ from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.localization.intra import LocalizationOptions
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.tracking import TrackingOptions

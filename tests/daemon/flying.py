@@ -16,7 +16,7 @@ from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_work import MapWork
-from vcl_companion.localization.intra import LocalizationOptions
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.swarm.group import SwarmOptions

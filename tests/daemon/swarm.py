@@ -43,7 +43,8 @@ from vcl_companion.links.counters import LinkCounters
 from vcl_companion.links.key_file import make_key_file
 from vcl_companion.links.messages import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions, open_signing
-from vcl_companion.localization.intra import LocalizationOptions, Localized
+from vcl_companion.localization.fix import Localized
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.localization.tracking import TrackingOptions

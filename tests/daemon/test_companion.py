@@ -39,7 +39,8 @@ from vcl_companion.geometry.rotation import matrix_from_euler, quaternion_from_m
 from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
-from vcl_companion.localization.intra import LocalizationOptions, Localized, NotLocalized
+from vcl_companion.localization.fix import Localized, NotLocalized
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.map_index import index_map
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.pose_filter import FilterOptions

@@ -8,7 +8,8 @@ import pytest
 from tests.daemon import demo
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.localization.intra import LocalizationOptions, Localized
+from vcl_companion.localization.fix import Localized
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.pose_filter import FilterOptions, FilterState, NotFused
 
 SURE = np.diag([0.02] * 3 + [0.002] * 3) ** 2

@@ -15,7 +15,7 @@ from tests.daemon.test_map_work import PAIR, pair, workplace
 from tests.daemon.waiting import run, until
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.map_work import MapWork
-from vcl_companion.localization.intra import Localized
+from vcl_companion.localization.fix import Localized
 from vcl_companion.localization.pipeline import ALL_EFFORT
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.wire.map_codec import revision_of

@@ -15,7 +15,7 @@ from vcl_companion.daemon.local_frame import LocalFrame
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3
 from vcl_companion.links.autopilot_options import Heading
-from vcl_companion.localization.intra import Localized
+from vcl_companion.localization.fix import Localized
 from vcl_companion.localization.pose_filter import FilterOptions, FilterState, started
 
 DRONE = 2

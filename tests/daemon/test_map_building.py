@@ -12,7 +12,7 @@ from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_building import build_map, update_map
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.camera import Camera
-from vcl_companion.localization.intra import Prior
+from vcl_companion.localization.fix import Prior
 from vcl_companion.localization.seen_by_patches import seen_by_patches
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.mapping.keyframe_image import encode_image

@@ -18,7 +18,8 @@ from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.errors import WireError
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.localization.intra import LocalizationOptions, Localized, Prior
+from vcl_companion.localization.fix import Localized, Prior
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.pipeline import ALL_EFFORT, PipelineOptions
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.mapping.landmark_map import LandmarkMap

@@ -30,7 +30,8 @@ from vcl_companion.geometry.rotation import (
 )
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
-from vcl_companion.localization.intra import LocalizationOptions, Localized, NotLocalized
+from vcl_companion.localization.fix import Localized, NotLocalized
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.pose_filter import FilterOptions, FilterState
 
 SYSTEM = 3

@@ -15,7 +15,8 @@ from vcl_companion.geometry.rotation import (
     matrix_from_euler,
     matrix_from_quaternion,
 )
-from vcl_companion.localization.intra import LocalizationOptions, Localized, NotLocalized
+from vcl_companion.localization.fix import Localized, NotLocalized
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.pose_filter import FilterOptions, FilterState, NotFused
 
 SURE = np.diag([0.02] * 3 + [0.002] * 3) ** 2

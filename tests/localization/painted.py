@@ -15,7 +15,8 @@ from tests.scenes import PINHOLE
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3
-from vcl_companion.localization.intra import LocalizationOptions, Localized, Prior
+from vcl_companion.localization.fix import Localized, Prior
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.tracking import TrackingOptions, track
 from vcl_companion.mapping.keyframe_image import encode_image
 from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap

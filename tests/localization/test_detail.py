@@ -12,7 +12,7 @@ from tests.scenes import PINHOLE
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import exp_so3
 from vcl_companion.localization.detail import needed_detail
-from vcl_companion.localization.intra import Localized
+from vcl_companion.localization.fix import Localized
 from vcl_companion.mapping.landmark_map import LandmarkMap
 
 NEAR = Pose(exp_so3(np.array([0.0, 0.0, -0.02])), np.array([-0.5, 0.3, -0.1]))

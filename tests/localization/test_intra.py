@@ -14,13 +14,9 @@ from tests.scenes import RADIAL_TANGENTIAL, facade_scene, perturbed
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, matrix_from_euler
-from vcl_companion.localization.intra import (
-    LocalizationOptions,
-    Localized,
-    NotLocalized,
-    Prior,
-    localize_intra,
-)
+from vcl_companion.localization.fix import Localized, NotLocalized, Prior
+from vcl_companion.localization.intra import localize_intra
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.lens_errors import N_LENS, lens_px

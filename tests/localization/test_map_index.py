@@ -16,13 +16,9 @@ from tests.scenes import perturbed, random_rotation
 from vcl_companion.geometry.camera import Camera, DistortionModel
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import matrix_from_euler
-from vcl_companion.localization.intra import (
-    LocalizationOptions,
-    Localized,
-    NotLocalized,
-    Prior,
-    localize_intra,
-)
+from vcl_companion.localization.fix import Localized, NotLocalized, Prior
+from vcl_companion.localization.intra import localize_intra
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.map_index import index_map
 from vcl_companion.mapping.keyframe_image import decode_image, encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap

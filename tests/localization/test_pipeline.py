@@ -12,13 +12,8 @@ from tests.checks import assert_pose_close, nees
 from tests.daemon import demo
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, about_down, exp_so3
-from vcl_companion.localization.intra import (
-    LocalizationOptions,
-    Localized,
-    NotLocalized,
-    Prior,
-    Recognised,
-)
+from vcl_companion.localization.fix import Localized, NotLocalized, Prior, Recognised
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.map_index import index_map
 from vcl_companion.localization.pipeline import Effort, PipelineOptions, localize
 from vcl_companion.localization.tracking import TrackingOptions

@@ -8,7 +8,7 @@ import pytest
 from tests.checks import assert_pose_close
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, matrix_from_euler
-from vcl_companion.localization.intra import Localized, NotLocalized
+from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.localization.pose_filter import (
     FilterOptions,
     FilterState,

@@ -19,12 +19,9 @@ from tests.scenes import PINHOLE
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3
-from vcl_companion.localization.intra import (
-    LocalizationOptions,
-    Localized,
-    Prior,
-    localize_intra,
-)
+from vcl_companion.localization.fix import Localized, Prior
+from vcl_companion.localization.intra import localize_intra
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.map_index import index_map
 from vcl_companion.localization.pipeline import Effort, PipelineOptions, is_doubtful, localize
 from vcl_companion.localization.tracking import TrackingOptions, track

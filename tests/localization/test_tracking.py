@@ -15,7 +15,8 @@ from tests.scenes import CAMERAS, PINHOLE, perturbed
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3
-from vcl_companion.localization.intra import LocalizationOptions, Localized, NotLocalized, Prior
+from vcl_companion.localization.fix import Localized, NotLocalized, Prior
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.tracking import TrackingOptions, track
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.templates import Templates, prepare_templates

@@ -10,7 +10,7 @@ import pytest
 from tests.mapping.rendered import CAMERA, panels, rendered, rendered_view
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import matrix_from_euler
-from vcl_companion.localization.intra import Prior
+from vcl_companion.localization.fix import Prior
 from vcl_companion.localization.seen_by_patches import seen_by_patches
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.mapping.drone_view import DroneView

@@ -19,7 +19,7 @@ from sitl.consistency.command import ConsistencyOptions, consistency
 from sitl.consistency.report import Beginning, nees_of, recording_report
 from tests.daemon.demo import DEMO
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.localization.intra import Localized
+from vcl_companion.localization.fix import Localized
 from vcl_companion.recording import Trajectory, read_recording
 
 

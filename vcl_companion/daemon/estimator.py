@@ -14,12 +14,8 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, quaternion_from_matrix
 from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.links.autopilot_options import Heading
-from vcl_companion.localization.intra import (
-    LocalizationOptions,
-    Localized,
-    NotLocalized,
-    disagreement,
-)
+from vcl_companion.localization.fix import Localized, NotLocalized, disagreement
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.pose_filter import (
     FilterOptions,
     FilterState,

@@ -17,7 +17,7 @@ from vcl_companion.clock import Clock
 from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.pose import Pose, euler_pose_covariance
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.localization.intra import Recognised
+from vcl_companion.localization.fix import Recognised
 from vcl_companion.swarm.peer_time import ClockRelation
 
 _log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from vcl_companion.cameras.source import CameraSource, Frame, Outcome
 from vcl_companion.clock import Clock, ManualClock
 from vcl_companion.daemon.flight_log import Basis, FlightLog, PoseSource
 from vcl_companion.daemon.health import Health
-from vcl_companion.localization.intra import NotLocalized
+from vcl_companion.localization.fix import NotLocalized
 
 _log = logging.getLogger(__name__)
 

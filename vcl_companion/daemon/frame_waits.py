@@ -10,7 +10,7 @@ from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.mailbox import Mailbox
 from vcl_companion.daemon.map_store import MapStore, StoredMap
-from vcl_companion.localization.intra import NotLocalized
+from vcl_companion.localization.fix import NotLocalized
 
 
 class FrameWaits:

@@ -15,7 +15,7 @@ from vcl_companion.daemon.mailbox import Mailbox
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.localization.intra import Localized, NotLocalized
+from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.localization.pipeline import Effort
 
 # How often a second detector looks for a drone that is lost: it takes as long as ten frames.

@@ -15,8 +15,8 @@ from vcl_companion.daemon.worker import Worker
 from vcl_companion.daemon.workshop import NotHereError, Workshop
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.detail import Detail
+from vcl_companion.localization.fix import Localized, NotLocalized, Prior
 from vcl_companion.localization.inter import NoProposal, Proposal
-from vcl_companion.localization.intra import Localized, NotLocalized, Prior
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pipeline import Effort
 from vcl_companion.localization.pose_filter import FilterState

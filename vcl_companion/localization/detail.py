@@ -6,7 +6,7 @@ from typing import Literal
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.localization.intra import Localized
+from vcl_companion.localization.fix import Localized
 from vcl_companion.localization.outlook import held_share
 from vcl_companion.mapping.landmark_map import LandmarkMap
 

@@ -1,20 +1,21 @@
-"""Where one drone is, from one image and the map (intra-MAV localization, IV-D, IV-F)."""
+"""Where one drone is, by one image's features and the map (intra-MAV localization, IV-D, IV-F)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, euler_from_matrix
+from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.coverage import covered_share
+from vcl_companion.localization.fix import Localized, NotLocalized, Prior, believed
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.mapping.lens_errors import lens_px
-from vcl_companion.vision.features import Detector, Features
+from vcl_companion.vision.features import Features
 from vcl_companion.vision.matching import MatchOptions, match_guided, match_to_entries
 from vcl_companion.vision.resection import (
     NotFound,
@@ -25,9 +26,6 @@ from vcl_companion.vision.resection import (
     refine,
     search,
 )
-
-Recognised = Literal["patches", "features"]
-"""What a pose rests on: the map's patches, or a detector's features."""
 
 _SURE_PX = 8.0
 # One landmark may decide this much of a pose that a prediction led to, and of one found without:
@@ -40,163 +38,6 @@ _LED_SHARE = 0.6
 _SURELY = 3.0
 # A pose that rests on single landmarks is taken to be off by so many times what it says.
 _UNDECIDED = 3.0
-
-
-@dataclass(frozen=True)
-class LocalizationOptions:
-    """When a pose is found, and when it is believed.
-
-    Attributes:
-        detector: features to look for; must be among those the maps are built with.
-        fallback_detector: looked for when a frame was not recognised by those; empty for none.
-        min_inliers: landmarks that must agree on a pose.
-        guided_radius_px: largest uncertainty of a prediction that still guides the matching.
-        noise_floor_px: pixel noise is never taken for smaller than this, 1 sigma.
-        bias_px_per_deg: misplacement of a feature per degree that the landmark is
-            seen from another side than in its keyframe, 1 sigma.
-        bias_px_per_octave: the same per doubling or halving of its distance.
-        max_sigma_m: a pose less certain than this in any direction is refused.
-        max_tilt_deg: roll and pitch may disagree with the autopilot's by this much.
-        max_heading_deg: heading may disagree with the autopilot's by this much.
-    """
-
-    detector: Detector = "akaze"
-    fallback_detector: Literal["akaze", "sift", "orb", ""] = "sift"
-    min_inliers: int = 15
-    guided_radius_px: float = 40.0
-    noise_floor_px: float = 0.4
-    bias_px_per_deg: float = 0.03
-    bias_px_per_octave: float = 1.5
-    max_sigma_m: float = 1.0
-    max_tilt_deg: float = 6.0
-    max_heading_deg: float = 25.0
-
-    def __post_init__(self) -> None:
-        if self.min_inliers < 6:
-            raise ValueError(f"min_inliers must be at least 6, got {self.min_inliers}")
-        for name in (
-            "guided_radius_px",
-            "noise_floor_px",
-            "max_sigma_m",
-            "max_tilt_deg",
-            "max_heading_deg",
-            "bias_px_per_deg",
-            "bias_px_per_octave",
-        ):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-
-    def of_any_heading(self) -> LocalizationOptions:
-        """Return the same where the autopilot's heading says nothing of the map's north."""
-        return replace(self, max_heading_deg=180.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Prior:
-    """Where the drone is expected: world_from_body and its (6, 6) local covariance."""
-
-    world_from_body: Pose
-    covariance: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Localized:
-    """A pose from one image.
-
-    Attributes:
-        world_from_body: the pose.
-        noise_covariance: (6, 6) local, from this image's pixel noise; new in every frame.
-        own_map_covariance: (6, 6) local, from the used landmarks' own errors and
-            from how differently they look from here.
-        map_lever: (6, 6V) local pose error per keyframe error of the map.
-        keyframe_covariance: (6V, 6V) of those.
-        n_matched: landmarks matched.
-        n_inliers: of these, how many agree.
-        guided: whether the prediction led the matching.
-        rms_px: of the inliers.
-        n_seen: landmarks of the map that this image shows, as far as can be told.
-        covered: share of the image that they fill, 0 to 1.
-        by: what was recognised.
-        novelty_deg: how differently they look from where they are remembered
-            (``coverage.novelty_deg``); 0 where nobody has looked.
-    """
-
-    world_from_body: Pose
-    noise_covariance: Array
-    own_map_covariance: Array
-    map_lever: Array
-    keyframe_covariance: Array
-    n_matched: int
-    n_inliers: int
-    guided: bool
-    rms_px: float
-    n_seen: int = 0
-    covered: float = 0.0
-    by: Recognised = "features"
-    novelty_deg: float = 0.0
-
-    def covariance(self) -> Array:
-        """Return (6, 6) the whole covariance of this pose alone, local."""
-        shared = self.map_lever @ self.keyframe_covariance @ self.map_lever.T
-        return np.asarray(self.noise_covariance + self.own_map_covariance + shared)
-
-
-@dataclass(frozen=True)
-class NotLocalized:
-    """No pose from this image, and why.
-
-    Attributes:
-        reason: for people.
-        n_matched: landmarks matched.
-        n_inliers: of these, how many agreed.
-        vague: a pose that was found, not to be believed, good enough to look from.
-    """
-
-    reason: str
-    n_matched: int = 0
-    n_inliers: int = 0
-    vague: Prior | None = field(default=None, compare=False)
-
-
-def believed(
-    fix: Localized, ned_from_body: Array | None, options: LocalizationOptions
-) -> Localized | NotLocalized:
-    """Return a pose only when it is certain enough and upright enough, else why not."""
-    n_matched, n_inliers = fix.n_matched, fix.n_inliers
-    covariance = fix.covariance()
-    if not np.all(np.isfinite(covariance)):
-        return NotLocalized("the landmarks found do not fix a pose", n_matched, n_inliers)
-    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-    if sigma > options.max_sigma_m:
-        return NotLocalized(
-            f"too uncertain: {sigma:.1f} m, {options.max_sigma_m:.1f} m allowed",
-            n_matched,
-            n_inliers,
-            Prior(fix.world_from_body, covariance),
-        )
-    if ned_from_body is not None:
-        reason = disagreement(fix.world_from_body.rotation, ned_from_body, options)
-        if reason:
-            return NotLocalized(reason, n_matched, n_inliers)
-    return fix
-
-
-def disagreement(world_from_body: Array, ned_from_body: Array, options: LocalizationOptions) -> str:
-    """Say how a rotation contradicts the autopilot's attitude; empty when it does not.
-
-    Args:
-        world_from_body: (3, 3) as an image says.
-        ned_from_body: (3, 3) as the autopilot says.
-        options: how much is too much.
-    """
-    tilt = np.rad2deg(np.arccos(np.clip(world_from_body[2] @ ned_from_body[2], -1.0, 1.0)))
-    if tilt > options.max_tilt_deg:
-        return f"disagrees with the autopilot's roll and pitch by {tilt:.0f} degrees"
-    _, _, yaw = euler_from_matrix(world_from_body @ ned_from_body.T)
-    heading = abs(np.rad2deg(yaw))
-    if heading > options.max_heading_deg:
-        return f"disagrees with the autopilot's heading by {heading:.0f} degrees"
-    return ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.localization.intra import NotLocalized, Prior
+from vcl_companion.localization.fix import NotLocalized, Prior
 from vcl_companion.vision.patches import Alignment
 from vcl_companion.vision.pose_kernels import CONVERGED, converged, supported
 

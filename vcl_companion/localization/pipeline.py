@@ -16,13 +16,9 @@ from typing import Literal
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.localization.intra import (
-    LocalizationOptions,
-    Localized,
-    NotLocalized,
-    Prior,
-    localize_intra,
-)
+from vcl_companion.localization.fix import Localized, NotLocalized, Prior
+from vcl_companion.localization.intra import localize_intra
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.tracking import TrackingOptions, track
 from vcl_companion.mapping.templates import Templates

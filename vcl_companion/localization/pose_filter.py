@@ -21,7 +21,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, about_down, exp_so3, heading_of, log_so3
 from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.localization.covariance_intersection import intersect, unlikeness
-from vcl_companion.localization.intra import Localized, NotLocalized, Prior
+from vcl_companion.localization.fix import Localized, NotLocalized, Prior
 
 _P, _B, _V, _W = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 _N_OWN = 12

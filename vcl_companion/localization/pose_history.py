@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.localization.intra import Localized, NotLocalized
+from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.localization.pose_filter import (
     FilterOptions,
     FilterState,

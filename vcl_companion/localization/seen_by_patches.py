@@ -6,7 +6,7 @@ import numpy as np
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.localization.intra import Prior
+from vcl_companion.localization.fix import Prior
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.mapping.patch_table import EXACTLY
 from vcl_companion.mapping.seen_landmarks import MAX_ASIDE_PX, SeenLandmarks

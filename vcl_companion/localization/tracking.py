@@ -11,13 +11,8 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose, adjoint
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.coverage import covered_share
-from vcl_companion.localization.intra import (
-    LocalizationOptions,
-    Localized,
-    NotLocalized,
-    Prior,
-    believed,
-)
+from vcl_companion.localization.fix import Localized, NotLocalized, Prior, believed
+from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.patch_pose import PatchPoses
 from vcl_companion.mapping.lens_errors import lens_px
 from vcl_companion.mapping.novelty import novelty_deg
