@@ -11,10 +11,10 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.coverage import covered_share
+from vcl_companion.localization.feature_errors import bias_px, map_error
 from vcl_companion.localization.fix import Localized, NotLocalized, Prior, believed
 from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.map_index import MapIndex
-from vcl_companion.mapping.lens_errors import lens_px
 from vcl_companion.vision.features import Features
 from vcl_companion.vision.matching import MatchOptions, match_guided, match_to_entries
 from vcl_companion.vision.resection import (
@@ -131,12 +131,11 @@ class _Matcher:
         """Match near where the pose puts each landmark, then refine from that pose."""
         cam_from_world = (world_from_body @ self.body_from_cam).inverse()
         predicted = self.camera.project(cam_from_world.apply(self.index.landmark_map.points_world))
-        margin = radius_px
         with np.errstate(invalid="ignore"):
             outside = (
-                (predicted < -margin).any(axis=1)
-                | (predicted[:, 0] > self.camera.width_px + margin)
-                | (predicted[:, 1] > self.camera.height_px + margin)
+                (predicted < -radius_px).any(axis=1)
+                | (predicted[:, 0] > self.camera.width_px + radius_px)
+                | (predicted[:, 1] > self.camera.height_px + radius_px)
             )
         predicted[outside] = np.nan
         found, landmarks = match_guided(
@@ -182,37 +181,22 @@ class _Matcher:
 
     def _fix(self, attempt: _Matched, result: Resection, guided: bool) -> Localized:
         n_matched, n_inliers = len(attempt.landmarks), int(result.inliers.sum())
+        landmarks, pixels = attempt.landmarks[result.inliers], attempt.pixels[result.inliers]
+        uncertainty = self.index.uncertainty
+        own, lever = map_error(result, landmarks, pixels, self.camera, uncertainty)
         return Localized(
             result.world_from_body,
             result.noise_covariance,
-            *self._map_error(
-                result, attempt.landmarks[result.inliers], attempt.pixels[result.inliers]
-            ),
-            self.index.uncertainty.keyframe_covariance,
+            own,
+            lever,
+            uncertainty.keyframe_covariance,
             n_matched,
             n_inliers,
             guided,
             result.rms_px,
             n_inliers,
-            covered_share(attempt.pixels[result.inliers], self.camera),
+            covered_share(pixels, self.camera),
         )
-
-    def _map_error(
-        self, result: Resection, landmarks: NDArray[np.intp], pixels: Array
-    ) -> tuple[Array, Array]:
-        """Return the pose's (6, 6) covariance by the landmarks' own errors, and its map lever."""
-        uncertainty = self.index.uncertainty
-        by_landmark = -result.gain @ result.jacobian_points
-        own = np.einsum(
-            "mij,mjk,mlk->il", by_landmark, uncertainty.landmark_covariance[landmarks], by_landmark
-        )
-        lever = np.einsum("mij,mjk->ik", by_landmark, uncertainty.landmark_lever[landmarks])
-        own += result.bias_covariance
-        if uncertainty.calibration_px:
-            off_px = lens_px(self.camera, pixels, uncertainty.calibration_px)
-            by_lens = np.einsum("mij,mjk->ik", result.gain, off_px)
-            own += by_lens @ by_lens.T
-        return np.asarray(0.5 * (own + own.T)), np.asarray(lever)
 
     def _sightings(
         self,
@@ -220,44 +204,22 @@ class _Matcher:
         landmarks: NDArray[np.intp],
         world_from_body: Pose | None,
     ) -> Sightings:
-        bias_px = np.zeros(len(landmarks))
+        landmark_map = self.index.landmark_map
+        misplaced_px = np.zeros(len(landmarks))
         if world_from_body is not None:
-            bias_px = self._bias_px(landmarks, world_from_body)
+            centre = (world_from_body @ self.body_from_cam).translation
+            misplaced_px = bias_px(landmark_map, landmarks, centre, self.options)
         ideal = self.camera.ideal_from_pixels(self.features.pixels[found])
         return Sightings(
             ideal,
-            self.index.landmark_map.points_world[landmarks],
+            landmark_map.points_world[landmarks],
             self.index.landmark_covariances[landmarks],
             self.camera.focal_px,
             self.camera.pixel_slopes(ideal),
             self.body_from_cam,
-            max(self.options.noise_floor_px, self.index.landmark_map.pixel_noise_px),
-            bias_px,
+            max(self.options.noise_floor_px, landmark_map.pixel_noise_px),
+            misplaced_px,
         )
-
-    def _bias_px(self, landmarks: NDArray[np.intp], world_from_body: Pose) -> Array:
-        """Return (M,) how far a detector may misplace landmarks that look different from here.
-
-        By how much, against the keyframe that saw the landmark most alike, the
-        viewing direction and the distance have changed.
-        """
-        points = self.index.landmark_map.points_world[landmarks]
-        seen = self.index.landmark_map.seen[landmarks]
-        ray = points - (world_from_body @ self.body_from_cam).translation
-        distance = np.linalg.norm(ray, axis=1)
-        least = np.full(len(landmarks), np.inf)
-        for i, keyframe in enumerate(self.index.landmark_map.keyframes):
-            origin = (keyframe.world_from_body @ keyframe.body_from_cam).translation
-            then = points - origin
-            distance_then = np.linalg.norm(then, axis=1)
-            cosine = np.einsum("mi,mi->m", ray, then) / np.maximum(distance * distance_then, 1e-9)
-            angle_deg = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
-            octaves = np.abs(np.log2(np.maximum(distance, 1e-3) / np.maximum(distance_then, 1e-3)))
-            bias = np.hypot(
-                self.options.bias_px_per_deg * angle_deg, self.options.bias_px_per_octave * octaves
-            )
-            least = np.where(seen[:, i], np.minimum(least, bias), least)
-        return least
 
     def _in_front(self, world_from_body: Pose, landmarks: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Return (M,) which landmarks are surely in front of the camera.
