@@ -25,8 +25,8 @@ from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.links.messages import Tunnel
 from vcl_companion.links.peers import PeerLink, PeerOptions, open_signing
+from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized
-from vcl_companion.localization.pose_filter import FilterState
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.swarm.group import SwarmOptions
 from vcl_companion.swarm.pose_requests import InterMavOptions

@@ -8,9 +8,11 @@ import pytest
 from tests.daemon import demo
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.geometry.pose import Pose
+from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized
 from vcl_companion.localization.localization_options import LocalizationOptions
-from vcl_companion.localization.pose_filter import FilterOptions, FilterState, NotFused
+from vcl_companion.localization.pose_filter import FilterOptions
+from vcl_companion.localization.proposals import NotFused
 
 SURE = np.diag([0.02] * 3 + [0.002] * 3) ** 2
 SPEED_M_S = FilterOptions().speed_m_s

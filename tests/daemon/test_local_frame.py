@@ -15,8 +15,9 @@ from vcl_companion.daemon.local_frame import LocalFrame
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3
 from vcl_companion.links.autopilot_options import Heading
+from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized
-from vcl_companion.localization.pose_filter import FilterOptions, FilterState, started
+from vcl_companion.localization.pose_filter import FilterOptions, started
 
 DRONE = 2
 NORTH_DEG = 12.0

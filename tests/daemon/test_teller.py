@@ -30,9 +30,10 @@ from vcl_companion.geometry.rotation import (
 )
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
+from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.localization.localization_options import LocalizationOptions
-from vcl_companion.localization.pose_filter import FilterOptions, FilterState
+from vcl_companion.localization.pose_filter import FilterOptions
 
 SYSTEM = 3
 START_NS = 1_760_000_000_000_000_000

@@ -18,11 +18,12 @@ from tests.scenes import PINHOLE
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, matrix_from_euler
+from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized
 from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.localization.pipeline import PipelineOptions, localize
-from vcl_companion.localization.pose_filter import FilterOptions, FilterState
+from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.vision.features import FeatureOptions

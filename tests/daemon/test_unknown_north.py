@@ -15,9 +15,11 @@ from vcl_companion.geometry.rotation import (
     matrix_from_euler,
     matrix_from_quaternion,
 )
+from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.localization.localization_options import LocalizationOptions
-from vcl_companion.localization.pose_filter import FilterOptions, FilterState, NotFused
+from vcl_companion.localization.pose_filter import FilterOptions
+from vcl_companion.localization.proposals import NotFused
 
 SURE = np.diag([0.02] * 3 + [0.002] * 3) ** 2
 BODY = matrix_from_euler(0.05, -0.04, 0.3)

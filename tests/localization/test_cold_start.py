@@ -17,12 +17,13 @@ from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_building import build_map
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import exp_so3, matrix_from_euler, quaternion_from_matrix
+from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.localization.intra import localize_intra
 from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.localization.pipeline import PipelineOptions, localize
-from vcl_companion.localization.pose_filter import FilterOptions, FilterState
+from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.mapping.keyframe_image import encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap

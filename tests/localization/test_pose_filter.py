@@ -14,12 +14,11 @@ from tests.checks import assert_consistent, assert_pose_close, numeric_jacobian
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, matrix_from_euler
 from vcl_companion.geometry.similarity import Similarity
+from vcl_companion.localization.filter_state import FilterState, carried
 from vcl_companion.localization.fix import Localized, NotLocalized, Recognised
 from vcl_companion.localization.pose_filter import (
     FilterOptions,
-    FilterState,
     _observation,
-    carried,
     predict,
     started,
     update,

@@ -8,18 +8,11 @@ import pytest
 from tests.checks import assert_pose_close
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, matrix_from_euler
+from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized, NotLocalized
-from vcl_companion.localization.pose_filter import (
-    FilterOptions,
-    FilterState,
-    NotFused,
-    fuse,
-    predict,
-    started,
-    started_from_proposal,
-    update,
-)
+from vcl_companion.localization.pose_filter import FilterOptions, predict, started, update
 from vcl_companion.localization.pose_history import PoseHistory
+from vcl_companion.localization.proposals import NotFused, fuse, started_from_proposal
 
 OPTIONS = FilterOptions()
 FRAME_NS = 200_000_000

@@ -24,9 +24,10 @@ from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.teller import Teller
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.localization.pipeline import Effort, PipelineOptions, is_doubtful, localize
-from vcl_companion.localization.pose_filter import FilterState, NotFused
+from vcl_companion.localization.proposals import NotFused
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.wire.pose_messages import PoseProposal
 

@@ -14,20 +14,12 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, quaternion_from_matrix
 from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.links.autopilot_options import Heading
+from vcl_companion.localization.filter_state import FilterState, carried, north_aligned
 from vcl_companion.localization.fix import Localized, NotLocalized, disagreement
 from vcl_companion.localization.localization_options import LocalizationOptions
-from vcl_companion.localization.pose_filter import (
-    FilterOptions,
-    FilterState,
-    NotFused,
-    carried,
-    north_aligned,
-    predict,
-    started,
-    started_from_proposal,
-    update,
-)
+from vcl_companion.localization.pose_filter import FilterOptions, predict, started, update
 from vcl_companion.localization.pose_history import PoseHistory
+from vcl_companion.localization.proposals import NotFused, started_from_proposal
 
 # So many fixes in a row that contradict the state are right, and the state is wrong.
 _MAX_CONTRADICTED = 5

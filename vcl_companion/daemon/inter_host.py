@@ -20,9 +20,9 @@ from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.peer_clocks import PeerClocks
 from vcl_companion.errors import WireError
+from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.inter import NoProposal, Proposal
 from vcl_companion.localization.map_index import MapIndex
-from vcl_companion.localization.pose_filter import FilterState
 from vcl_companion.vision.features import Detector
 from vcl_companion.wire.pose_messages import (
     PoseProposal,

@@ -17,7 +17,7 @@ from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, about_down, heading_of
 from vcl_companion.links.autopilot_options import Heading
-from vcl_companion.localization.pose_filter import FilterState
+from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.swarm.group import Group
 
 _log = logging.getLogger(__name__)

@@ -15,11 +15,11 @@ from vcl_companion.daemon.worker import Worker
 from vcl_companion.daemon.workshop import NotHereError, Workshop
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.detail import Detail
+from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized, NotLocalized, Prior
 from vcl_companion.localization.inter import NoProposal, Proposal
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pipeline import Effort
-from vcl_companion.localization.pose_filter import FilterState
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import NoMap
 from vcl_companion.mapping.seen_landmarks import SeenLandmarks

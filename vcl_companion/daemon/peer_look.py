@@ -10,10 +10,10 @@ import numpy as np
 from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.rotation import matrix_from_quaternion
+from vcl_companion.localization.filter_state import FilterState, north_aligned
 from vcl_companion.localization.inter import NoProposal, Proposal, localize_inter
 from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.localization.pair_evidence import Observer
-from vcl_companion.localization.pose_filter import FilterState, north_aligned
 from vcl_companion.mapping.keyframe_image import decode_image
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.pose_requests import InterMavOptions

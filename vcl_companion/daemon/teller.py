@@ -26,7 +26,7 @@ from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.texts import Severity
 from vcl_companion.links.vision_pose import PoseEstimate
-from vcl_companion.localization.pose_filter import FilterState
+from vcl_companion.localization.filter_state import FilterState
 
 _log = logging.getLogger(__name__)
 

@@ -18,11 +18,11 @@ from vcl_companion.daemon.peer_look import PeerLook
 from vcl_companion.daemon.usage import give_back_freed
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.detail import Detail
+from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized, NotLocalized, Prior
 from vcl_companion.localization.inter import NoProposal, Proposal
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pipeline import Effort, PipelineOptions, localize
-from vcl_companion.localization.pose_filter import FilterState
 from vcl_companion.localization.seen_by_patches import seen_by_patches
 from vcl_companion.mapping.continuity import newest_part
 from vcl_companion.mapping.keyframe_image import encode_image

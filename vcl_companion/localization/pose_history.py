@@ -12,15 +12,10 @@ from dataclasses import dataclass
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized, NotLocalized
-from vcl_companion.localization.pose_filter import (
-    FilterOptions,
-    FilterState,
-    NotFused,
-    fuse,
-    predict,
-    update,
-)
+from vcl_companion.localization.pose_filter import FilterOptions, predict, update
+from vcl_companion.localization.proposals import NotFused, fuse
 
 # A proposal is for a frame's own instant; clocks may round it.
 _SAME_INSTANT_NS = 1_000_000
