@@ -22,7 +22,8 @@ from dataclasses import dataclass
 from vcl_companion.errors import ConfigError
 from vcl_companion.swarm.epochs import FIRST, VACANT, Epochs, taken_by
 from vcl_companion.swarm.overlap import OverlapGraph, OverlapOptions
-from vcl_companion.swarm.pace import FULL_PACE_S, stretch_of
+from vcl_companion.swarm.pace import stretch_of
+from vcl_companion.swarm.presence import Presence
 from vcl_companion.swarm.swarm_options import SwarmOptions
 from vcl_companion.swarm.teams import Meetings, Parting, Roster, team_with_a_map
 from vcl_companion.wire.messages import MapState
@@ -33,9 +34,6 @@ __all__ = ["Group", "GroupEvent", "PeerJoined", "PeerLost", "SwarmOptions"]
 _SIGNATURE_INTERVAL_S = 2.9
 # So often at rest where all are at full pace.
 _SIGNATURE_EVERY_S = 4.0
-# Who has said nothing for this share of the time-out, and for so long, s, is not waited for any
-# more; it speaks once a second, in a large swarm more rarely (``pace``).
-_SILENT, _SILENT_S = 0.5, 2.5
 _SAID_NOTHING = MapState(b"", 0, False)
 
 
@@ -72,13 +70,8 @@ class Group:
         self.members = tuple(sorted(options.members)) or (own_id,)
         self.leader = options.leader or self.members[0]
         self.measured = tuple(sorted({m for a, b, _ in options.known_distances for m in (a, b)}))
-        self._timeout_s = options.heartbeat_timeout_s
-        self._silent_s = max(_SILENT * self._timeout_s, _SILENT_S)
-        self._stretch = stretch_of(len(self.members))
         self._leader_wait_s = options.leader_wait_s
-        self._heard_at_s: dict[int, float] = {}  # members alive
-        self._hasty_until_s = -math.inf  # at full pace until then
-        self._ever_heard: set[int] = set()
+        self._presence = Presence(self.members, own_id, options.heartbeat_timeout_s)
         self._states: dict[int, MapState] = {}  # ours, and of members alive
         self._distrusted: frozenset[int] = frozenset()
         self._apart: frozenset[int] = frozenset()
@@ -87,16 +80,12 @@ class Group:
         self._teammates: tuple[int, ...] | None = None
         self._epochs = Epochs(own_id)
         # One rides on a state.
-        told_s = math.ceil(_SIGNATURE_INTERVAL_S / self._stretch) * self._stretch
+        stretch = stretch_of(len(self.members))
+        told_s = math.ceil(_SIGNATURE_INTERVAL_S / stretch) * stretch
         overlaps = OverlapOptions().stretched(told_s / _SIGNATURE_EVERY_S)
         self._graph = OverlapGraph(self.members, overlaps)
         self._parting = Parting(self._graph, options.split_after_s)
         self._meetings = Meetings(self._graph, options.rejoin_after_s)
-        self._began_at_s = math.inf
-        self._now_s = -math.inf
-        # Who coordinated when that was last looked at, and since when: it shows itself at full
-        # pace from then on.
-        self._led_by, self._led_since_s = own_id, -math.inf
         self._signature = b""
         self._told_signature_at_s = -math.inf
 
@@ -108,7 +97,7 @@ class Group:
     @property
     def alive(self) -> tuple[int, ...]:
         """Members that are there as far as known, this drone among them, ascending."""
-        return tuple(m for m in self.members if m == self.own_id or m in self._heard_at_s)
+        return self._presence.alive
 
     @property
     def trusted(self) -> tuple[int, ...]:
@@ -154,7 +143,7 @@ class Group:
         did until now and may be waited for as that yet, and while those who have just come may
         not have heard everybody.
         """
-        return 1.0 if self._now_s < self._hasty_until_s or self.is_coordinator else self._stretch
+        return 1.0 if self.is_coordinator else self._presence.stretch
 
     @property
     def newest_revision(self) -> bytes:
@@ -206,7 +195,7 @@ class Group:
     @property
     def teams_met(self) -> tuple[int, ...]:
         """Other teams that have been seeing what ours sees for ``rejoin_after_s``, ascending."""
-        return self._meetings.lasting(self._now_s)
+        return self._meetings.lasting(self._presence.now_s)
 
     def team_of(self, member: int) -> int:
         """Return the team that a member says it flies with; 0 where it has said nothing."""
@@ -245,22 +234,16 @@ class Group:
 
     def heartbeat(self, peer: int, now_s: float) -> list[GroupEvent]:
         """Note that a peer is heard; who is no member is ignored."""
-        self._note_time(now_s)
-        if peer == self.own_id or peer not in self.members:
+        if not self._presence.hear(peer, now_s):
             return []
-        is_new = peer not in self._heard_at_s
-        self._heard_at_s[peer] = max(now_s, self._heard_at_s.get(peer, now_s))
-        self._ever_heard.add(peer)
-        if is_new:
-            self._hasty_until_s = now_s + self._timeout_s
-            self._teammates = None
-            self._take_term()
-        return [PeerJoined(peer)] if is_new else []
+        self._teammates = None
+        self._take_term()
+        return [PeerJoined(peer)]
 
     def map_state(self, peer: int, state: MapState, now_s: float) -> list[GroupEvent]:
         """Note which map a peer flies on, which is a sign of life too."""
         events = self.heartbeat(peer, now_s)
-        if peer not in self._heard_at_s:
+        if not self._presence.is_heard(peer):
             return events
         before = self._states.get(peer, _SAID_NOTHING)
         has_moved = peer not in self._distrusted and self._takes_us_along(peer, state)
@@ -282,7 +265,7 @@ class Group:
 
     def note_signature(self, signature: bytes, now_s: float) -> None:
         """Take the signature of a frame of our own (``vision/signature.py``)."""
-        self._note_time(now_s)
+        self._presence.note_time(now_s)
         self._signature = signature
         self._graph.note(self.own_id, signature, now_s)
 
@@ -368,31 +351,7 @@ class Group:
 
     def is_silent(self, member: int) -> bool:
         """Whether a member may be lost, which is known later: nobody else waits for its word."""
-        heard_at_s = self._heard_at_s.get(member)
-        silent_s = self._silent_s + self._longer_s
-        return heard_at_s is not None and self._now_s >= heard_at_s + silent_s
-
-    @property
-    def _longer_s(self) -> float:
-        """By how much longer than in a small swarm the next sign of life of others may take."""
-        return (self._stretch - 1.0) * FULL_PACE_S
-
-    def _lost_at_s(self, member: int) -> float:
-        """Return when a member is lost if nothing is heard of it until then."""
-        heard_at_s = self._heard_at_s[member]
-        lost_at_s = heard_at_s + self._timeout_s * self._stretch
-        if member != self._led_by:
-            return lost_at_s
-        # It shows itself at full pace if it knows that it coordinates.
-        if heard_at_s < self._led_since_s:
-            return min(lost_at_s, self._led_since_s + self._timeout_s + self._longer_s)
-        return heard_at_s + self._timeout_s if self._claims_to_lead(member) else lost_at_s
-
-    def _claims_to_lead(self, member: int) -> bool:
-        if member == self.leader:
-            return True
-        state = self._states.get(member)
-        return state is not None and state.team == self._team and taken_by(state.epoch) == member
+        return self._presence.is_silent(member)
 
     def most_others_hold(self, revision: bytes) -> bool:
         """Whether most of the other teammates trusted, and at least two, hold a revision."""
@@ -405,10 +364,8 @@ class Group:
 
         What team we fly with, and who leads it, is seen to as well.
         """
-        self._note_time(now_s)
-        late = [p for p in self._heard_at_s if now_s >= self._lost_at_s(p)]
-        for peer in late:
-            del self._heard_at_s[peer]
+        lost = self._presence.take_lost(now_s, knows_lead=self._knows_lead)
+        for peer in lost:
             self._states.pop(peer, None)
             self._teammates = None
             self._graph.forget(peer)
@@ -417,40 +374,35 @@ class Group:
         self._go_to(self._team_by(roster))
         self._meetings.poll(roster, now_s)
         self._take_term()
-        led_by = self.coordinator
-        if led_by != self._led_by:
-            self._led_by, self._led_since_s = led_by, now_s
-        if led_by == self.own_id:
-            self._hasty_until_s = now_s + self._timeout_s
-        return [PeerLost(peer) for peer in sorted(late)]
+        self._presence.note_lead(self.coordinator, now_s)
+        return [PeerLost(peer) for peer in sorted(lost)]
 
     def next_poll_s(self) -> float | None:
         """Return when somebody is lost if nothing is heard until then; None for nobody."""
-        if not self._heard_at_s:
-            return None
-        return min(map(self._lost_at_s, self._heard_at_s))
+        return self._presence.next_lost_s(knows_lead=self._knows_lead)
 
     @property
     def _awaits_leader(self) -> bool:
         """Whether the leader, which nobody has lost yet, may still come to our team."""
-        if self._team != 0 or self.leader in self._ever_heard:
+        if self._team != 0 or self._is_leader_gone:
             return False
-        if self._has_waited_for_leader:
-            return False
-        return self.epoch == FIRST or not self._has_listened
+        return self.epoch == FIRST or not self._presence.has_listened
 
     @property
-    def _has_waited_for_leader(self) -> bool:
-        return self._now_s >= self._began_at_s + self._leader_wait_s
+    def _is_leader_gone(self) -> bool:
+        """Whether the leader, unless it is there, was lost or has been waited for long enough."""
+        return self._presence.has_heard(self.leader) or self._presence.has_lasted(
+            self._leader_wait_s
+        )
 
     @property
-    def _has_listened(self) -> bool:
-        """Whether everybody who is there has been heard by now."""
-        return self._now_s >= self._began_at_s + self._timeout_s
-
-    def _note_time(self, now_s: float) -> None:
-        self._began_at_s = min(self._began_at_s, now_s)
-        self._now_s = max(self._now_s, now_s)
+    def _knows_lead(self) -> bool:
+        """Whether who coordinated when that was last looked at says that it does."""
+        member = self._presence.led_by
+        if member == self.leader:
+            return True
+        state = self._states.get(member)
+        return state is not None and state.team == self._team and taken_by(state.epoch) == member
 
     def _go_to(self, team: int) -> None:
         if team != self._team:
@@ -458,8 +410,7 @@ class Group:
 
     def _take_term(self) -> None:
         """Take an epoch when this drone has begun to coordinate, or hears of a newer one."""
-        is_lost = self.leader in self._ever_heard or self._has_waited_for_leader
-        if self._team == 0 and is_lost and self.leader not in self.alive:
+        if self._team == 0 and self._is_leader_gone and self.leader not in self.alive:
             self._epochs.hear(0, VACANT)
         if not self.is_coordinator or self._epochs.is_ours(self._team):
             return
@@ -478,8 +429,8 @@ class Group:
     def _team_by(self, roster: Roster) -> int:
         """Return the team that this drone is to fly with by now."""
         if self.own_id in roster.world_of:
-            return self._parting.team(roster, self._now_s)
-        return team_with_a_map(roster) if self._has_listened else self._team
+            return self._parting.team(roster, self._presence.now_s)
+        return team_with_a_map(roster) if self._presence.has_listened else self._team
 
     def _roster(self) -> Roster:
         believed = {m for m in self.alive if m not in self._distrusted or m == self.leader}
