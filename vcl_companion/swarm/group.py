@@ -15,13 +15,12 @@ it has not heard itself: until then it knows neither who is there nor the epochs
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 from vcl_companion.errors import ConfigError
 from vcl_companion.swarm.epochs import FIRST, VACANT, Epochs, taken_by
-from vcl_companion.swarm.overlap import OverlapGraph, OverlapOptions
+from vcl_companion.swarm.overlap import OverlapGraph, OverlapOptions, OwnSignature
 from vcl_companion.swarm.pace import stretch_of
 from vcl_companion.swarm.presence import Presence
 from vcl_companion.swarm.swarm_options import SwarmOptions
@@ -30,10 +29,6 @@ from vcl_companion.wire.messages import MapState
 
 __all__ = ["Group", "GroupEvent", "PeerJoined", "PeerLost", "SwarmOptions"]
 
-# A signature is told no more often: 48 bytes more each time.
-_SIGNATURE_INTERVAL_S = 2.9
-# So often at rest where all are at full pace.
-_SIGNATURE_EVERY_S = 4.0
 _SAID_NOTHING = MapState(b"", 0, False)
 
 
@@ -79,15 +74,11 @@ class Group:
         # Asked for with every message, and changed by hardly any; None: to be found anew.
         self._teammates: tuple[int, ...] | None = None
         self._epochs = Epochs(own_id)
-        # One rides on a state.
-        stretch = stretch_of(len(self.members))
-        told_s = math.ceil(_SIGNATURE_INTERVAL_S / stretch) * stretch
-        overlaps = OverlapOptions().stretched(told_s / _SIGNATURE_EVERY_S)
+        overlaps = OverlapOptions().at_pace(stretch_of(len(self.members)))
         self._graph = OverlapGraph(self.members, overlaps)
         self._parting = Parting(self._graph, options.split_after_s)
         self._meetings = Meetings(self._graph, options.rejoin_after_s)
-        self._signature = b""
-        self._told_signature_at_s = -math.inf
+        self._signature = OwnSignature()
 
     @property
     def peers(self) -> tuple[int, ...]:
@@ -266,16 +257,12 @@ class Group:
     def note_signature(self, signature: bytes, now_s: float) -> None:
         """Take the signature of a frame of our own (``vision/signature.py``)."""
         self._presence.note_time(now_s)
-        self._signature = signature
+        self._signature.note(signature)
         self._graph.note(self.own_id, signature, now_s)
 
     def signature_to_tell(self, now_s: float) -> bytes:
         """Return what the next state is to tell: the newest signature, once, and not too often."""
-        if not self._signature or now_s < self._told_signature_at_s + _SIGNATURE_INTERVAL_S:
-            return b""
-        signature, self._signature = self._signature, b""
-        self._told_signature_at_s = now_s
-        return signature
+        return self._signature.to_tell(now_s)
 
     def state_of(self, member: int) -> MapState | None:
         """Return what a member last said of its map; None if nothing, or it is lost."""

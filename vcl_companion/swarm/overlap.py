@@ -11,6 +11,7 @@ of 100 members that tell one in six seconds each that is 2 ms of every second, a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -22,6 +23,11 @@ from vcl_companion.vision.signature import (
     log_likelihood_ratios,
     words_of,
 )
+
+# A signature is told no more often: 48 bytes more each time.
+_TOLD_AFTER_S = 2.9
+# So often at rest where all are at full pace.
+_TOLD_EVERY_S = 4.0
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,32 @@ class OverlapOptions:
         """Return them for members who tell their signatures so many times as rarely, if they do."""
         by = max(1.0, by)
         return replace(self, apart_s=by * self.apart_s, fresh_s=by * self.fresh_s)
+
+    def at_pace(self, stretch: float) -> OverlapOptions:
+        """Return them for members who show themselves so many times as rarely (``pace``)."""
+        # A signature rides on a state.
+        told_s = math.ceil(_TOLD_AFTER_S / stretch) * stretch
+        return self.stretched(told_s / _TOLD_EVERY_S)
+
+
+class OwnSignature:
+    """The signature of a drone's newest frame, until it is told."""
+
+    def __init__(self) -> None:
+        self._untold = b""
+        self._told_at_s = -math.inf
+
+    def note(self, signature: bytes) -> None:
+        """Take one in the place of the last."""
+        self._untold = signature
+
+    def to_tell(self, now_s: float) -> bytes:
+        """Return what the next state is to tell: the newest, once, and not too often."""
+        if not self._untold or now_s < self._told_at_s + _TOLD_AFTER_S:
+            return b""
+        signature, self._untold = self._untold, b""
+        self._told_at_s = now_s
+        return signature
 
 
 class OverlapGraph:
