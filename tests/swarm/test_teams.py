@@ -224,6 +224,13 @@ _CHANGES = st.one_of(
     st.sampled_from([0, 1, 4]),
 )
 @example([("stop", 1, 0), ("run", 0, 9), ("start", 1, 0)], 0, 0.0, 0.0, 0)
+@example(
+    [("place", 1, 1), ("run", 0, 16), ("run", 0, 17), ("start", 1, 0), ("start", 3, 0)],
+    0,
+    0.0,
+    0.0,
+    0,
+)
 @settings(max_examples=150, deadline=None)
 def test_whatever_happens_teams_agree_in_the_end(
     changes: list[tuple[str, int, int]], seed: int, loss: float, late_s: float, leader: int

@@ -397,7 +397,8 @@ class Group:
 
     def _take_term(self) -> None:
         """Take an epoch when this drone has begun to coordinate, or hears of a newer one."""
-        if self._team == 0 and self._is_leader_gone and self.leader not in self.alive:
+        # It may be there, and fly with another team.
+        if self._team == 0 and self._is_leader_gone and self.leader not in self.teammates:
             self._epochs.hear(0, VACANT)
         if not self.is_coordinator or self._epochs.is_ours(self._team):
             return
