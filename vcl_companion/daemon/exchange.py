@@ -167,7 +167,7 @@ class Exchange:
             self._passed,
             transfers.frames_carried_in_s,
             lambda: transfers.is_receiving(BlobKind.MAP, self._now_s()),
-            lambda: self._sharing.is_merging,
+            lambda: self._sharing.merging.is_under_way,
             log,
             clock,
             self.clocks,
@@ -287,7 +287,7 @@ class Exchange:
             request_id: the round's.
         """
         if isinstance(built, LandmarkMap):
-            refused = await self._sharing.adopt(built, instead_of)
+            refused = await self._sharing.own_maps.adopt(built, instead_of)
             if refused is None:
                 return
             built = refused
@@ -382,7 +382,7 @@ class Exchange:
 
     async def go_back_to(self, data: bytes) -> str:
         """Fly on a map that was saved; return why it cannot be used, or nothing."""
-        return await self._sharing.go_back_to(data)
+        return await self._sharing.own_maps.go_back_to(data)
 
     @property
     def update_progress(self) -> int:
@@ -398,7 +398,7 @@ class Exchange:
         self._own_state.poll(now_s)  # a frame may just have been answered
         return (
             self._rounds.is_coming
-            or self._sharing.is_merging
+            or self._sharing.merging.is_under_way
             or bool(self._group.lacking())
             or self._own_state.is_undecided(now_s)
         )

@@ -1,0 +1,108 @@
+"""Merging a map that went apart from ours into ours, beside the rounds that extend it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from contextlib import suppress
+
+from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.map_branches import MapBranches
+from vcl_companion.daemon.map_offer import MapOffer
+from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.mishaps import made_or_no_map
+from vcl_companion.daemon.own_maps import OwnMaps
+from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.options import NoMap
+
+_log = logging.getLogger(__name__)
+
+_BETWEEN_MERGES_S = 0.5
+# A round that ours is being updated in is let end before ours is merged, but not for longer.
+_ROUND_S, _LOOK_S = 5.0, 0.05
+# Ours changes while it is merged with another one, but hardly so often.
+_MERGE_ATTEMPTS = 3
+
+
+class MapMerging:
+    """Makes our next revision of ours and a peer's, one peer's at a time.
+
+    Args:
+        maps: the current map.
+        log: told of every attempt.
+        work: does the merging.
+        branches: told what came of it.
+        own_maps: flies on what was made.
+        is_updating: whether a round of ours is under way that updates the map.
+
+    Attributes:
+        is_under_way: whether another map is being merged into ours.
+    """
+
+    def __init__(
+        self,
+        maps: MapStore,
+        log: FlightLog,
+        work: MapWork,
+        branches: MapBranches,
+        own_maps: OwnMaps,
+        is_updating: Callable[[], bool],
+    ) -> None:
+        self._maps = maps
+        self._log = log
+        self._work = work
+        self._branches = branches
+        self._own_maps = own_maps
+        self._is_updating = is_updating
+        self.is_under_way = False
+
+    async def merge(self, peer: int, offer: MapOffer) -> bool:
+        """Make our next revision of ours and a peer's that went apart; whether that was done."""
+        self.is_under_way = True
+        try:
+            await self._round_is_over()
+            is_merged = await self._merge_into_current(peer, offer)
+        finally:
+            self.is_under_way = False
+        # Whoever offers one after the other does not keep ours from being extended.
+        await asyncio.sleep(_BETWEEN_MERGES_S)
+        return is_merged
+
+    async def _round_is_over(self) -> None:
+        """Wait for the round that is under way: merged with what it replaces, all would be in vain.
+
+        Another one does not begin meanwhile.
+        """
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_ROUND_S):
+                while self._is_updating():
+                    await asyncio.sleep(_LOOK_S)
+
+    async def _merge_into_current(self, peer: int, offer: MapOffer) -> bool:
+        """Merge a peer's map into whichever is in use, again where that changes meanwhile."""
+        self._log.event("merge", f"map {offer.revision.hex()} of drone {peer} into ours")
+        made: LandmarkMap | NoMap = NoMap("ours changed meanwhile, again and again")
+        for _ in range(_MERGE_ATTEMPTS):
+            current = self._maps.current
+            if current is None:
+                break
+            made = await made_or_no_map(
+                self._work.merged(current, offer.blob), "a map cannot be merged", "merging failed"
+            )
+            if isinstance(made, LandmarkMap):
+                made = await self._own_maps.adopt(made, current) or made
+            if isinstance(made, NoMap):
+                break
+            now = self._maps.current
+            if now is not None and now.parent == current.revision and now.has_in_it(offer.revision):
+                self._branches.merged(peer)
+                self._log.event("merged", f"map {offer.revision.hex()} of drone {peer}")
+                _log.info("the map of drone %d is merged into ours", peer)
+                return True
+        reason = made.reason if isinstance(made, NoMap) else "ours changed meanwhile"
+        self._branches.refused(offer.revision)
+        self._log.event("not merged", f"map of drone {peer}: {reason}")
+        _log.warning("the map of drone %d is not merged into ours: %s", peer, reason)
+        return False
