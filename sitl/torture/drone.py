@@ -212,7 +212,7 @@ class TorturedDrone:
             return
         if before is None or before.revision != stored.revision:
             self.done["another map is in use"] += 1
-        self.estimator.seen_on = stored.revision
+        self.estimator.in_sight.seen_on = stored.revision
         predicted = self.estimator.predicted(at_ns, None)
         if knows_where:
             fix = _fix(scene.world_from_body(place))

@@ -150,7 +150,7 @@ class Drone:
 
     def _looked(self) -> None:
         """Have a frame been looked at on the map in use, as a companion would say."""
-        self.estimator.seen_on = self.revision
+        self.estimator.in_sight.seen_on = self.revision
 
     def track(self, n_landmarks: int, at: Pose | None = None) -> None:
         """Have the drone look at a frame with so many landmarks in it, without one at 0.

@@ -468,7 +468,7 @@ def test_a_frame_the_map_does_not_know_is_localized_on_the_next_one(tmp_path: Pa
         async with flying(tmp_path, frame_wait_s=60.0) as up:
             up.fly_on_nothing_known()
             up.give(0)
-            await until(lambda: up.estimator.tracked == 0 and up.maps.current is not None)
+            await until(lambda: up.estimator.in_sight.tracked == 0 and up.maps.current is not None)
             up.fly_on_a_map()
             await up.server.answered()
             assert up.frames() == [(0, "localized", None)]
@@ -500,15 +500,15 @@ def test_a_frame_that_is_looked_for_leads_those_that_came_meanwhile(tmp_path: Pa
             up.shop.is_open.clear()
             for k, shot in enumerate(demo.shot(DRONE, k) for k in range(4)):
                 up.give(k)
-                await until(partial(up.estimator.has_looked_at, shot.at_ns))
+                await until(partial(up.estimator.in_sight.has_looked_at, shot.at_ns))
             assert up.frames() == []
-            assert up.estimator.seen_on == b""  # what the map lacks cannot be said yet
-            assert up.estimator.sought_since_s is not None
+            assert up.estimator.in_sight.seen_on == b""  # what the map lacks cannot be said yet
+            assert up.estimator.in_sight.sought_since_s is not None
             up.shop.is_open.set()
             await up.server.answered()
             assert sorted(up.frames()) == [(k, "localized", None) for k in range(4)]
-            assert up.estimator.seen_on != b""
-            assert up.estimator.sought_since_s is None
+            assert up.estimator.in_sight.seen_on != b""
+            assert up.estimator.in_sight.sought_since_s is None
             # Which speed that is nobody knew before; the next one is found at once.
             up.shop.is_open.clear()
             up.give(4)
@@ -525,7 +525,7 @@ def test_peers_are_asked_where_a_search_takes_long_and_not_before(tmp_path: Path
             up.shop.is_open.clear()
             for k, shot in enumerate(demo.shot(DRONE, k) for k in range(3)):
                 up.give(k)
-                await until(partial(up.estimator.has_looked_at, shot.at_ns))
+                await until(partial(up.estimator.in_sight.has_looked_at, shot.at_ns))
             assert up.asked == []
             hurry(0.6)
             up.give(3)
@@ -544,7 +544,7 @@ def test_of_many_frames_that_came_during_a_search_every_second_is_let_go(tmp_pat
             up.shop.is_open.clear()
             for k, shot in enumerate(demo.shot(DRONE, k) for k in range(20)):
                 up.give(k)
-                await until(partial(up.estimator.has_looked_at, shot.at_ns))
+                await until(partial(up.estimator.in_sight.has_looked_at, shot.at_ns))
             await until(lambda: len(up.frames()) == 8)
             reason = "lost, and not looked for again yet"
             assert up.frames() == [(k, "refused", reason) for k in range(2, 18, 2)]
@@ -561,9 +561,9 @@ def test_a_search_in_vain_that_others_overtook_leaves_time_for_them(tmp_path: Pa
             up.fly_on_nothing_known(tracked=True)
             up.shop.is_open.clear()
             up.give(0)
-            await until(lambda: up.estimator.has_looked_at(demo.shot(DRONE, 0).at_ns))
+            await until(lambda: up.estimator.in_sight.has_looked_at(demo.shot(DRONE, 0).at_ns))
             up.give(1)
-            await until(lambda: up.estimator.has_looked_at(demo.shot(DRONE, 1).at_ns))
+            await until(lambda: up.estimator.in_sight.has_looked_at(demo.shot(DRONE, 1).at_ns))
             await asyncio.sleep(0.3)  # so long it takes, and so long is not looked again
             up.shop.is_open.set()
             await up.server.answered()

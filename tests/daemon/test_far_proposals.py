@@ -41,7 +41,7 @@ def proposed(estimator: Estimator, at_ns: int, metres: float) -> FilterState | N
 def test_nobody_is_taken_for_faster_than_he_flies(silent_s: float) -> None:
     """By its covariance alone, or for want of any, the filter would believe a kilometre."""
     estimator, at_ns = after_a_fix(silent_s)
-    assert not estimator.has_own_fix_near(at_ns)
+    assert not estimator.last_own_fix.is_near(at_ns)
     reach_m = 5.0 * SPEED_M_S * silent_s
     far = proposed(estimator, at_ns, 1.1 * reach_m)
     assert isinstance(far, NotFused)
@@ -60,10 +60,10 @@ def test_what_comes_too_late_contradicts_nothing() -> None:
     off = proposed(estimator, 0, 5.0)
     assert isinstance(off, NotFused)
     assert off.contradicts
-    assert estimator.has_own_fix_near(0)
+    assert estimator.last_own_fix.is_near(0)
 
 
 def test_a_drone_that_has_seen_nothing_yet_is_placed_by_its_peers() -> None:
     estimator = Estimator(FilterOptions(), LocalizationOptions(), lambda _: None)
     assert isinstance(proposed(estimator, 0, 900.0), FilterState)
-    assert not estimator.has_own_fix_near(0)
+    assert not estimator.last_own_fix.is_near(0)

@@ -83,7 +83,7 @@ def test_a_target_that_sees_too_little_gets_its_pose_through_a_host(tmp_path: Pa
             assert two.sources()[1:] == [(1, "localized", "inter")]
             assert two.bases() == [(0, "peer"), (1, "peer")]
             assert one.bases() == [(0, "patches"), (1, "patches")]
-            assert two.drone.estimator.tracked == 0
+            assert two.drone.estimator.in_sight.tracked == 0
             assert one.sources() == [(0, "localized", "intra"), (1, "localized", "intra")]
             assert dict(one.drone.exchange.refused) == dict(two.drone.exchange.refused) == {}
 

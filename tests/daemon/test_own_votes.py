@@ -13,11 +13,11 @@ PLENTY = 500
 def seek(drone: Drone) -> None:
     """Have the drone refuse a frame by its patches, and look for it by its features."""
     drone.track(0)
-    drone.estimator.sought_since_s = asyncio.get_running_loop().time()
+    drone.estimator.in_sight.sought_since_s = asyncio.get_running_loop().time()
 
 
 def find(drone: Drone) -> None:
-    drone.estimator.sought_since_s = None
+    drone.estimator.in_sight.sought_since_s = None
     drone.track(PLENTY)
 
 

@@ -186,7 +186,7 @@ class Companion:
             self._doubted_at_s = now_s
         refused = self._take(frame, fix, ned_from_body)
         if isinstance(fix, Localized) or not follows:
-            self._estimator.seen_on = stored.revision
+            self._estimator.in_sight.seen_on = stored.revision
         if isinstance(fix, NotLocalized) and follows:
             search = self._map_search
             if search.is_under_way:
@@ -230,7 +230,7 @@ class Companion:
         try:
             stored, fix = await self._map_search.found(sought)
             refused = self._take(frame, fix, sought.ned_from_body)
-            self._estimator.seen_on = stored.revision
+            self._estimator.in_sight.seen_on = stored.revision
             while refused is None and (behind := self._behind.take()) is not None:
                 await self._look_again(*behind)
         finally:
@@ -271,7 +271,7 @@ class Companion:
         """
         sigma_m = math.inf if refused else self._estimator.sigma_m
         now_s = asyncio.get_running_loop().time()
-        is_sought = self._estimator.is_being_sought(now_s)
+        is_sought = self._estimator.in_sight.is_being_sought(now_s)
         is_led = refused is not None and self._map_search.is_behind(frame) and is_sought
         asked = None
         if not is_led:
@@ -370,7 +370,7 @@ class Companion:
         why = state.reason if isinstance(state, NotFused) else ""
         # Without a fix of our own one peer may only be said to contradict another.
         tells = not isinstance(state, NotFused) or state.contradicts
-        if tells and self._estimator.has_own_fix_near(at_ns):
+        if tells and self._estimator.last_own_fix.is_near(at_ns):
             self._inter.judged(host, why)
         self._log.estimate(at_ns, pose, covariance, fused=not why, host=host, reason=why)
         return None if isinstance(state, NotFused) else state

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 from collections.abc import Callable
-from contextlib import suppress
 
 import numpy as np
 
+from vcl_companion.daemon.last_own_fix import FRESH_NS, LastOwnFix
 from vcl_companion.daemon.local_frame import LocalFrame
+from vcl_companion.daemon.map_in_sight import MapInSight
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, quaternion_from_matrix
 from vcl_companion.geometry.similarity import Similarity
@@ -25,14 +25,7 @@ from vcl_companion.localization.proposals import NotFused, started_from_proposal
 _MAX_CONTRADICTED = 5
 # How far back a proposal may reach; a peer that takes longer speaks of another place.
 HISTORY_S = 5.0
-# For so long what a frame shows counts as unknown while it is looked for by its features: a small
-# map is looked through by then.
-_SOUGHT_S = 0.5
-# A fix this old is no more where we are.
-_FRESH_NS = 2_000_000_000
 _LEAST_ARM_M = 1.0
-# Nobody flies faster than so many sigmas of the speed, nor is further from where he was.
-_FASTEST_SIGMAS = 5.0
 
 
 class Estimator:
@@ -67,23 +60,13 @@ class Estimator:
         self._history = PoseHistory(HISTORY_S, options)
         self._n_contradicted = 0
         self._has_begun = False
-        self._own_fix: FilterState | None = None
-        self._looked_at_ns = -1
-        self._looked = asyncio.Event()
         self.n_resets = 0
         self.local = LocalFrame(heading)
         """The frame that the autopilot is told poses in."""
-        self.tracked = 0
-        """Landmarks of the map that the last frame showed; 0 when it was refused."""
-        self.covered = 0.0
-        """Share of the last frame that they filled; 0 when it was refused."""
-        self.seen_on = b""
-        """Revision of the map that the last frame was looked at on."""
-        self.novelty_deg = 0.0
-        """How differently they looked there from how they are remembered, degrees."""
-        self.sought_since_s: float | None = None
-        """Since when a frame is looked for by its features, by the loop's time; None where none
-        is, or where the map was looked through in vain before."""
+        self.in_sight = MapInSight()
+        """What the frames show of the map."""
+        self.last_own_fix = LastOwnFix(options.speed_m_s)
+        """What proposals are held against."""
 
     @property
     def has_heading(self) -> bool:
@@ -110,7 +93,7 @@ class Estimator:
     def is_localized(self, now_ns: int) -> bool:
         """Whether a frame of the last two seconds gave a pose, by a fix or by a proposal."""
         state = self._history.newest
-        return state is not None and now_ns - state.fixed_at_ns <= _FRESH_NS
+        return state is not None and now_ns - state.fixed_at_ns <= FRESH_NS
 
     @property
     def sigma_m(self) -> float:
@@ -131,19 +114,11 @@ class Estimator:
         pose = state.world_from_body
         return Pose(pose.rotation, pose.translation + ahead_s * state.velocity_world)
 
-    def is_being_sought(self, now_s: float) -> bool:
-        """Whether what the frames show will be known in a moment.
-
-        One is looked for by its features, has been for no long time, and none after it gave a pose.
-        """
-        since_s = self.sought_since_s
-        return since_s is not None and now_s < since_s + _SOUGHT_S and not self.tracked
-
     def forget(self) -> None:
         """Know nothing of where we are any more: the next frame is looked for everywhere."""
         self._history.clear()
         self._n_contradicted = 0
-        self._own_fix = None
+        self.last_own_fix.forget()
 
     def own_fix_at(self, at_ns: int) -> FilterState | None:
         """Return what was believed at a frame that had a fix of its own; None at any other."""
@@ -152,18 +127,6 @@ class Estimator:
     def fix_at(self, at_ns: int) -> Localized | None:
         """Return what a frame gave of its own; None when that was nothing."""
         return self._history.fix_at(at_ns)
-
-    def has_looked_at(self, at_ns: int) -> bool:
-        """Whether the frame of an instant, or a later one, has been looked at."""
-        return self._looked_at_ns >= at_ns
-
-    async def looked_at(self, at_ns: int, within_s: float) -> None:
-        """Wait until the frame of an instant has been looked at, or the time is over."""
-        with suppress(TimeoutError):
-            async with asyncio.timeout(within_s):
-                while not self.has_looked_at(at_ns):
-                    self._looked.clear()
-                    await self._looked.wait()
 
     def predicted(self, at_ns: int, ned_from_body: Array | None) -> FilterState | None:
         """Return the state carried to a frame's instant; None when there is none, or too old.
@@ -184,10 +147,9 @@ class Estimator:
         """Note a frame without a fix: one may still come for its instant, or a proposal."""
         if self._is_late(at_ns):
             return
-        self.tracked, self.covered, self.novelty_deg = 0, 0.0, 0.0
         if predicted is not None:
             self._history.append(predicted, None, ned_from_body)
-        self._note(at_ns)
+        self.in_sight.note(at_ns, None)
 
     def coasted_at(self, at_ns: int) -> FilterState | None:
         """Return where attitude and motion alone put a frame that gave no fix.
@@ -270,11 +232,9 @@ class Estimator:
             self._relocalized(fix)
         self._n_contradicted = 0
         self._has_begun = True
-        self.tracked, self.covered = fix.n_seen, fix.covered
-        self.novelty_deg = fix.novelty_deg
         self._history.append(state, fix, ned_from_body)
-        self._own_fix = state
-        self._note(at_ns)
+        self.last_own_fix.note(state)
+        self.in_sight.note(at_ns, fix)
         return state
 
     def _take_late(self, fix: Localized, at_ns: int) -> FilterState | NotLocalized:
@@ -319,7 +279,7 @@ class Estimator:
             reason = disagreement(world_from_body.rotation, ned_from_body, options)
             if reason:
                 return NotFused(reason, contradicts=True)
-        too_far = self._too_far(at_ns, world_from_body, covariance)
+        too_far = self.last_own_fix.too_far(at_ns, world_from_body, covariance)
         if too_far:
             return NotFused(too_far, contradicts=True)
         if self._history.newest is None:
@@ -359,41 +319,12 @@ class Estimator:
         else:
             self.local.leave()
             self._jump("joined another world")
-        if self._own_fix is not None:
-            self._own_fix = carried(self._own_fix, other_from_world)
-
-    def has_own_fix_near(self, at_ns: int) -> bool:
-        """Whether a fix of our own, not two seconds from an instant, says where we were then."""
-        own = self._own_fix
-        return own is not None and abs(at_ns - own.at_ns) <= _FRESH_NS
-
-    def _too_far(self, at_ns: int, world_from_body: Pose, covariance: Array) -> str:
-        """Say how a pose cannot be reached from our last own fix; empty if it can.
-
-        The filter's own gate widens with the square of the time, and there is none where it
-        has begun anew; soon after a fix it is the narrower one.
-        """
-        own = self._own_fix
-        if own is None or self.has_own_fix_near(at_ns):
-            return ""
-        away = world_from_body.translation - own.world_from_body.translation
-        metres = float(np.linalg.norm(away))
-        since_s = abs(at_ns - own.at_ns) * 1e-9
-        spread = own.pose_covariance()[:3, :3] + covariance[:3, :3]
-        sigma_m = math.sqrt(float(np.linalg.eigvalsh(spread)[-1]))
-        reach_m = _FASTEST_SIGMAS * (self._options.speed_m_s * since_s + sigma_m)
-        if metres <= reach_m + _LEAST_ARM_M:
-            return ""
-        return f"{metres:.1f} m from our last own fix, {since_s:.1f} s away from it"
+        self.last_own_fix.carry(other_from_world)
 
     def _is_late(self, at_ns: int) -> bool:
         """Whether a later frame has been taken in already."""
         newest = self._history.newest
         return newest is not None and at_ns < newest.at_ns
-
-    def _note(self, at_ns: int) -> None:
-        self._looked_at_ns = at_ns
-        self._looked.set()
 
     def _begins_anew(self, fix: Localized) -> bool:
         """Count a fix against the state; leave the state, and return True, if it is believed now.

@@ -198,7 +198,7 @@ class FrameAnswers:
         """Return how much of one of our frames the map in use is extended by."""
         at_ns = frame.captured_at_ns
         if self._estimator.is_localized(self._clock.now_ns()):
-            await self._estimator.looked_at(at_ns, _SETTLE_S)
+            await self._estimator.in_sight.looked_at(at_ns, _SETTLE_S)
         stored = self._maps.current
         if stored is None:
             return "all"

@@ -162,7 +162,7 @@ class InterHost:
         """Return our frame nearest to an instant that had a fix, and what we believed then."""
         frames = self._frames.near(at_ns)
         if frames:
-            await self._estimator.looked_at(frames[0].captured_at_ns, _SETTLE_S)
+            await self._estimator.in_sight.looked_at(frames[0].captured_at_ns, _SETTLE_S)
         for frame in frames:
             state = self._estimator.own_fix_at(frame.captured_at_ns)
             if state is not None:

@@ -92,7 +92,7 @@ class MapSearch:
         """
         self._over.clear()
         if not self._was_searched(stored):
-            self._estimator.sought_since_s = asyncio.get_running_loop().time()
+            self._estimator.in_sight.sought_since_s = asyncio.get_running_loop().time()
         self._sought_at_ns = frame.captured_at_ns
         may_fall_back = now_s >= self._fell_back_at_s + _FALL_BACK_EVERY_S
         return Sought(frame, ned_from_body, stored, may_fall_back)
@@ -100,7 +100,7 @@ class MapSearch:
     def end(self) -> None:
         """Note that what was begun is over."""
         self._over.set()
-        self._estimator.sought_since_s = None
+        self._estimator.in_sight.sought_since_s = None
 
     async def ended(self) -> None:
         """Wait until no frame is being looked for."""

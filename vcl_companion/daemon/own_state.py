@@ -109,7 +109,7 @@ class OwnState:
             stored.told_revision if stored else b"",
             stored.n_landmarks if stored else 0,
             self._estimator.is_localized(self._clock.now_ns()),
-            min(self._estimator.tracked, MAX_TRACKED),
+            min(self._estimator.in_sight.tracked, MAX_TRACKED),
             self._wants_update,
             self._group.team,
             self._group.epoch,
@@ -126,7 +126,7 @@ class OwnState:
         """Look at what we see of the map; whether our vote for an update has changed."""
         stored = self._maps.current
         before = self._wants_update
-        seen = self._estimator
+        seen = self._estimator.in_sight
         revision = stored.revision if stored else b""
         group = self._group
         is_coming = group.is_map_coming
@@ -135,7 +135,7 @@ class OwnState:
             self._wants_update = self._vote.unseen()
             return self._wants_update != before
         if stored is None or not seen.is_being_sought(now_s):
-            sigma_m = seen.sigma_m if seen.tracked else None
+            sigma_m = self._estimator.sigma_m if seen.tracked else None
             self._wants_update = self._vote.look(
                 revision,
                 Sight(seen.tracked, seen.covered, sigma_m, seen.novelty_deg),
@@ -163,7 +163,7 @@ class OwnState:
         localized = self._estimator.is_localized(self._clock.now_ns())
         if told is None or told.localized != localized:
             return _INTERVAL_S
-        change = abs(self._estimator.tracked - told.tracked)
+        change = abs(self._estimator.in_sight.tracked - told.tracked)
         interval_s = _INTERVAL_S * (1.0 if now_s < self._news_until_s else self._group.stretch)
         is_news = change > _NEWS_SHARE * max(told.tracked, 1)
         return interval_s if is_news else max(_AT_REST_S, interval_s)

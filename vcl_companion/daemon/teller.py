@@ -158,7 +158,9 @@ class Teller:
 
     def _still_unseen(self) -> list[int]:
         """Return the instants of frames that have come, and were not looked at yet."""
-        return [at_ns for at_ns in self._unseen if not self._estimator.has_looked_at(at_ns)]
+        return [
+            at_ns for at_ns in self._unseen if not self._estimator.in_sight.has_looked_at(at_ns)
+        ]
 
     def _is_too_near(self, at_ns: int, frame_ns: int) -> bool:
         """Whether a pose between frames would come after a frame's, or leave it no room."""

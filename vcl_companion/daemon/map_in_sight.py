@@ -1,0 +1,64 @@
+"""What the frames show of the map, and which of them have been looked at yet."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+
+from vcl_companion.localization.intra import Localized
+
+# For so long what a frame shows counts as unknown while it is looked for by its features: a small
+# map is looked through by then.
+_SOUGHT_S = 0.5
+
+
+class MapInSight:
+    """The map as the last frame showed it; everything happens in the event loop's thread.
+
+    Attributes:
+        tracked: landmarks of the map that the last frame showed; 0 when it was refused.
+        covered: share of the last frame that they filled; 0 when it was refused.
+        novelty_deg: how differently they looked there from how they are remembered, degrees.
+        seen_on: revision of the map that the last frame was looked at on.
+        sought_since_s: since when a frame is looked for by its features, by the loop's time;
+            None where none is, or where the map was looked through in vain before.
+    """
+
+    def __init__(self) -> None:
+        self.tracked = 0
+        self.covered = 0.0
+        self.novelty_deg = 0.0
+        self.seen_on = b""
+        self.sought_since_s: float | None = None
+        self._looked_at_ns = -1
+        self._looked = asyncio.Event()
+
+    def note(self, at_ns: int, fix: Localized | None) -> None:
+        """Note what the frame of an instant has shown; None for one that was refused."""
+        if fix is None:
+            self.tracked, self.covered, self.novelty_deg = 0, 0.0, 0.0
+        else:
+            self.tracked, self.covered = fix.n_seen, fix.covered
+            self.novelty_deg = fix.novelty_deg
+        self._looked_at_ns = at_ns
+        self._looked.set()
+
+    def is_being_sought(self, now_s: float) -> bool:
+        """Whether what the frames show will be known in a moment.
+
+        One is looked for by its features, has been for no long time, and none after it gave a pose.
+        """
+        since_s = self.sought_since_s
+        return since_s is not None and now_s < since_s + _SOUGHT_S and not self.tracked
+
+    def has_looked_at(self, at_ns: int) -> bool:
+        """Whether the frame of an instant, or a later one, has been looked at."""
+        return self._looked_at_ns >= at_ns
+
+    async def looked_at(self, at_ns: int, within_s: float) -> None:
+        """Wait until the frame of an instant has been looked at, or the time is over."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                while not self.has_looked_at(at_ns):
+                    self._looked.clear()
+                    await self._looked.wait()
