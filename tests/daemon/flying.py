@@ -16,6 +16,8 @@ from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.own_fixes import OwnFixes
+from vcl_companion.daemon.peer_poses import PeerPoses
 from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.tracking import TrackingOptions
@@ -78,18 +80,22 @@ async def flying(
         companion = Companion(
             camera,
             FrameOutcomes(camera, drone.clock, health, drone.log),
-            sensor,
-            drone.autopilot_link,
+            OwnFixes(
+                sensor,
+                drone.autopilot_link,
+                drone.maps,
+                drone.estimator,
+                drone.log,
+                stack.enter_context(ThreadPoolExecutor(1)),
+                options,
+            ),
+            PeerPoses(drone.exchange.inter, drone.maps, drone.estimator, drone.log),
             drone.teller,
             drone.maps,
             drone.estimator,
-            drone.exchange.inter,
             drone.exchange.on_frame,
             health,
-            drone.log,
-            stack.enter_context(ThreadPoolExecutor(1)),
             work,
-            options,
             frame_wait_s=0.1,
         )
         await stack.enter_async_context(beside(companion.read_camera(), companion.run()))

@@ -31,6 +31,8 @@ from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.message_requests import MessageRequests
 from vcl_companion.daemon.onboard_computer import OnboardComputer
+from vcl_companion.daemon.own_fixes import OwnFixes
+from vcl_companion.daemon.peer_poses import PeerPoses
 from vcl_companion.daemon.saved_map import SavedMap
 from vcl_companion.daemon.settings import open_settings
 from vcl_companion.daemon.teller import Teller
@@ -227,11 +229,14 @@ class Flyer(Drone):
         source.is_busy = self.exchange.is_busy
         with ThreadPoolExecutor(1) as executor:
             health = Health(self.autopilot_link, self.log)
-            companion = Companion(
-                source, FrameOutcomes(source, self.clock, health, self.log), sensor,
-                self.autopilot_link, self.teller, self.maps, self.estimator, self.exchange.inter,
-                self.exchange.on_frame, health, self.log, executor, self.work,
+            own_fixes = OwnFixes(
+                sensor, self.autopilot_link, self.maps, self.estimator, self.log, executor,
                 PipelineOptions(demo.FEATURES, LocalizationOptions(), TrackingOptions()),
+            )  # fmt: skip
+            companion = Companion(
+                source, FrameOutcomes(source, self.clock, health, self.log), own_fixes,
+                PeerPoses(self.exchange.inter, self.maps, self.estimator, self.log), self.teller,
+                self.maps, self.estimator, self.exchange.on_frame, health, self.work,
                 frame_wait_s=0.1,
             )  # fmt: skip
             try:

@@ -24,7 +24,7 @@ from tests.daemon.waiting import beside, hurry, run, until
 from vcl_companion.cameras.source import Frame
 from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import ManualClock
-from vcl_companion.daemon.companion import Companion, _AskedPeers
+from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_history import FrameHistory
@@ -33,6 +33,8 @@ from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.inter_target import Asked, InterTarget
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.own_fixes import OwnFixes
+from vcl_companion.daemon.peer_poses import AskedPeers, PeerPoses
 from vcl_companion.daemon.teller import Teller
 from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.geometry.rotation import matrix_from_euler, quaternion_from_matrix
@@ -63,6 +65,8 @@ class Flight:
     """One drone's line from camera to autopilot, its camera and its autopilot."""
 
     companion: Companion
+    executor: ThreadPoolExecutor
+    peer_poses: PeerPoses
     estimator: Estimator
     outcomes: FrameOutcomes
     clock: ManualClock
@@ -192,15 +196,18 @@ async def flight(
         estimator = Estimator(motion, OPTIONS.localization, lambda _: None)
         teller = Teller(link, estimator, clock, log, rates)
         asked: list[int] = []
+        inter = target_of(peers, asked, work, clock, estimator)
+        peer_poses = PeerPoses(inter, maps, estimator, log)
         companion = Companion(
-            camera, outcomes, sensor, link, teller, maps, estimator,
-            target_of(peers, asked, work, clock, estimator), history.add, health, log, executor,
-            work, OPTIONS, frame_wait_s,
+            camera, outcomes, OwnFixes(sensor, link, maps, estimator, log, executor, OPTIONS),
+            peer_poses, teller, maps, estimator, history.add, health, work, frame_wait_s,
         )  # fmt: skip
         await stack.enter_async_context(beside(link.run()))
         assert await link.attitudes.at(first.at_ns, 5.0) is not None
         yield Flight(
             companion,
+            executor,
+            peer_poses,
             estimator,
             outcomes,
             clock,
@@ -330,8 +337,7 @@ def test_what_was_looked_at_in_a_world_that_was_left_is_looked_at_again(tmp_path
     async def scenario() -> None:
         async with flying(tmp_path) as up:
             up.fly_on_a_map()
-            executor = up.companion._executor
-            assert isinstance(executor, ThreadPoolExecutor)
+            executor = up.executor
             looks = threading.Barrier(2)
             for k in range(6):
                 if k == 3:
@@ -384,11 +390,11 @@ def test_what_peers_say_of_a_world_that_was_left_is_not_believed(tmp_path: Path)
             frame = Frame(shot.image, shot.at_ns, 0, 0)
             revision = stored.revision
             asked = Asked(1, frame, shot.ned_from_body.rotation, revision, np.inf, {1}, [])
-            before = _AskedPeers(asked, weakref.ref(stored), stored.world, np.zeros((1, 3)), None)
+            before = AskedPeers(asked, weakref.ref(stored), stored.world, np.zeros((1, 3)), None)
             there = demo.world_from_body(DRONE, 0)
             said = PoseProposal.of(1, revision, there, 1e-4 * np.eye(6))
             join(up)
-            assert up.companion._fuse(1, said, before) is None
+            assert up.peer_poses.fuse(1, said, before) is None
             assert up.estimator.sigma_m == np.inf
 
     run(scenario())

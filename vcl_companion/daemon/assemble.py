@@ -36,6 +36,8 @@ from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.memory_watch import MemoryWatch
 from vcl_companion.daemon.message_requests import MessageRequests
 from vcl_companion.daemon.onboard_computer import OnboardComputer
+from vcl_companion.daemon.own_fixes import OwnFixes
+from vcl_companion.daemon.peer_poses import PeerPoses
 from vcl_companion.daemon.saved_map import SavedMap
 from vcl_companion.daemon.scheduling import run_before_others
 from vcl_companion.daemon.settings import open_settings
@@ -214,18 +216,14 @@ async def _run(config: Config) -> int:
     companion = Companion(
         camera,
         outcomes,
-        sensor,
-        autopilot,
+        OwnFixes(sensor, autopilot, maps, estimator, log, vision, pipeline),
+        PeerPoses(exchange.inter, maps, estimator, log),
         teller,
         maps,
         estimator,
-        exchange.inter,
         exchange.on_frame,
         health,
-        log,
-        vision,
         work,
-        pipeline,
         config.update.frame_wait_s,
     )
     peers = PeerLink(

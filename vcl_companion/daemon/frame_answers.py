@@ -10,13 +10,13 @@ import numpy as np
 
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
-from vcl_companion.daemon.companion import ATTITUDE_WAIT_S
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.mailbox import PeerMailbox
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.own_fixes import ATTITUDE_WAIT_S
 from vcl_companion.daemon.peer_clocks import PeerClocks
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.localization.detail import Detail, needed_detail

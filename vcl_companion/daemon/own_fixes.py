@@ -1,0 +1,156 @@
+"""A frame's own fix: looked for by the map from where the drone is believed, and taken in."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+from vcl_companion.cameras.source import Frame
+from vcl_companion.daemon.estimator import Estimator
+from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.links.autopilot import AutopilotLink
+from vcl_companion.localization.intra import Localized, NotLocalized
+from vcl_companion.localization.pipeline import Effort, PipelineOptions, is_doubtful, localize
+from vcl_companion.localization.pose_filter import FilterState
+from vcl_companion.recording.sensor import Sensor
+
+# How long an attitude sample may still be on its way when its frame is here.
+ATTITUDE_WAIT_S = 0.1
+# How often features are asked about a pose that few patches agree on.
+_DOUBT_EVERY_S = 5.0
+_PATCHES_ALONE = Effort(may_search=False, may_doubt=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What one look at a frame has given.
+
+    Attributes:
+        stored: the map that it was looked at on.
+        ned_from_body: (3, 3) the frame's attitude, or None.
+        fix: where it was taken, or why that cannot be said.
+        began_at_s: by the loop's time.
+    """
+
+    stored: StoredMap
+    ned_from_body: Array | None
+    fix: Localized | NotLocalized
+    began_at_s: float
+
+
+class OwnFixes:
+    """Looks at frames beside the event loop, and brings the state up to what they give.
+
+    Args:
+        sensor: the camera's calibration and mounting.
+        autopilot: gives attitude.
+        maps: the current map.
+        estimator: the pose filter.
+        log: told of every fix.
+        executor: runs the vision.
+        options: of the steps.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        autopilot: AutopilotLink,
+        maps: MapStore,
+        estimator: Estimator,
+        log: FlightLog,
+        executor: Executor,
+        options: PipelineOptions,
+    ) -> None:
+        self._sensor = sensor
+        self._autopilot = autopilot
+        self._maps = maps
+        self._estimator = estimator
+        self._log = log
+        self._executor = executor
+        self._options = options
+        self._doubted_at_s = -math.inf
+
+    async def look(self, frame: Frame, stored: StoredMap) -> Look:
+        """Look at a frame on a map: by its patches, or all over it where it has none.
+
+        Where the world of that map is left meanwhile, on the one that is in use then.
+        """
+        while True:
+            ned_from_body = await self._attitude_of(frame)
+            now_s = asyncio.get_running_loop().time()
+            may_doubt = now_s >= self._doubted_at_s + _DOUBT_EVERY_S
+            effort = Effort(may_search=stored.templates is None, may_doubt=may_doubt)
+            fix = await self._localized(frame, stored, ned_from_body, effort)
+            if not self._maps.has_left_world(stored.world):
+                break
+            stored = self._maps.current or stored
+        if isinstance(fix, Localized) and is_doubtful(fix):
+            self._doubted_at_s = now_s
+        return Look(stored, ned_from_body, fix, now_s)
+
+    async def look_by_patches(self, frame: Frame) -> Look | None:
+        """Look at a frame by patches alone, once.
+
+        Returns:
+            What that gave; None without a map that has some, or where its world was left meanwhile.
+        """
+        stored = self._maps.current
+        if stored is None or stored.templates is None:
+            return None
+        ned_from_body = await self._attitude_of(frame)
+        now_s = asyncio.get_running_loop().time()
+        fix = await self._localized(frame, stored, ned_from_body, _PATCHES_ALONE)
+        if self._maps.has_left_world(stored.world):
+            return None
+        return Look(stored, ned_from_body, fix, now_s)
+
+    async def _attitude_of(self, frame: Frame) -> Array | None:
+        attitude = await self._autopilot.attitudes.at(frame.captured_at_ns, ATTITUDE_WAIT_S)
+        return None if attitude is None else attitude.ned_from_body
+
+    async def _localized(
+        self, frame: Frame, stored: StoredMap, ned_from_body: Array | None, effort: Effort
+    ) -> Localized | NotLocalized:
+        """Return what a frame gives from where the drone is believed to have been then."""
+        predicted = self._estimator.predicted(frame.captured_at_ns, ned_from_body)
+        return await asyncio.get_running_loop().run_in_executor(
+            self._executor,
+            localize,
+            frame.image,
+            self._sensor.camera,
+            self._sensor.body_from_cam,
+            stored.index,
+            stored.templates,
+            predicted.prior() if predicted else None,
+            ned_from_body,
+            self._options,
+            replace(effort, has_heading=self._estimator.has_heading),
+        )
+
+    def take(
+        self, frame: Frame, fix: Localized, ned_from_body: Array | None
+    ) -> FilterState | NotLocalized:
+        """Bring the state up to a frame's fix; or say why that is not believed."""
+        at_ns = frame.captured_at_ns
+        # Again, not as it was before the vision: a proposal may have come meanwhile.
+        predicted = self._estimator.predicted(at_ns, ned_from_body)
+        state = self._estimator.take_fix(predicted, fix, at_ns, ned_from_body)
+        refused = state if isinstance(state, NotLocalized) else None
+        self._log.estimate(
+            at_ns,
+            fix.world_from_body,
+            fix.covariance(),
+            fused=refused is None,
+            reason=refused.reason if refused else "",
+        )
+        return state
+
+    def take_nothing(self, frame: Frame, ned_from_body: Array | None) -> None:
+        """Bring the state up to a frame that gave no fix."""
+        at_ns = frame.captured_at_ns
+        predicted = self._estimator.predicted(at_ns, ned_from_body)
+        self._estimator.take_nothing(predicted, at_ns, ned_from_body)
