@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from vcl_companion.cli import main, set_up_logging
+from vcl_companion.cli import main
+from vcl_companion.cli.journal import set_up_logging
 from vcl_companion.config import LogOptions
 
 

@@ -179,7 +179,7 @@ def test_the_check_finds_a_violation(file: str, source: str) -> None:
         ("vcl_companion/vision/a.py", "from vcl_companion.geometry.pose import Pose"),
         ("vcl_companion/vision/a.py", "from vcl_companion.vision.b import c\nfrom . import b"),
         ("vcl_companion/vision/a.py", "from vcl_companion import geometry, errors"),
-        ("vcl_companion/cli.py", "from vcl_companion.daemon.assemble import run_daemon"),
+        ("vcl_companion/cli/__init__.py", "from vcl_companion.daemon.assemble import run_daemon"),
         ("vcl_companion/links/mavlink.py", "from pymavlink.dialects.v20 import common"),
         ("vcl_companion/cameras/oak.py", "def f():\n    import depthai"),
         ("sitl/fly.py", "import mavsdk, vcl_companion.daemon.health"),
