@@ -140,7 +140,7 @@ class ScaledDrone:
     async def fly_on(self, built: LandmarkMap) -> None:
         """Fly on a map as its coordinator does on one that it has built, and hand it out."""
         exchange, current = self._parts.exchange, self._parts.maps.current
-        deciding = exchange.decide(built, current, request_id=0)
+        deciding = exchange.results.decide(built, current, request_id=0)
         await asyncio.get_running_loop().create_task(deciding, context=self._context)
 
     def check(self) -> None:

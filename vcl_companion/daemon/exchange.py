@@ -9,7 +9,6 @@ said leaves by the ``outbox``. Here these are joined, and kept going.
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 from collections.abc import Mapping
 from concurrent.futures import Executor
@@ -20,6 +19,7 @@ import numpy as np
 
 from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
+from vcl_companion.daemon.answer_hearers import AnswerHearers
 from vcl_companion.daemon.deliveries import Deliveries
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
@@ -29,7 +29,7 @@ from vcl_companion.daemon.inter_host import InterHost
 from vcl_companion.daemon.inter_target import InterTarget
 from vcl_companion.daemon.map_rounds import MapRounds, RoundOptions
 from vcl_companion.daemon.map_sharing import MapSharing
-from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.outbox import Outbox
 from vcl_companion.daemon.own_state import OwnState
@@ -38,12 +38,13 @@ from vcl_companion.daemon.peer_clocks import PeerClocks
 from vcl_companion.daemon.peer_messages import PeerMessages
 from vcl_companion.daemon.peer_presence import PeerPresence
 from vcl_companion.daemon.peer_trust import PeerTrust
+from vcl_companion.daemon.place_signature import keep_place_known
 from vcl_companion.daemon.refusals import Refusals
+from vcl_companion.daemon.round_results import RoundResults
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.messages import Tunnel
 from vcl_companion.links.peers import PeerLink
-from vcl_companion.mapping.landmark_map import LandmarkMap
-from vcl_companion.mapping.options import MapOptions, NoMap
+from vcl_companion.mapping.options import MapOptions
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.pace import look_s
@@ -52,11 +53,6 @@ from vcl_companion.swarm.quarantine import QuarantineOptions
 from vcl_companion.swarm.transfer import BlobKind, Transfers
 from vcl_companion.swarm.update_options import UpdateOptions
 from vcl_companion.vision.features import Detector
-from vcl_companion.wire.messages import MapRefused
-
-_log = logging.getLogger(__name__)
-
-_SIGNATURE_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -111,19 +107,19 @@ class Exchange:
         options: ExchangeOptions,
         rng: np.random.Generator,
     ) -> None:
-        self._system_id = system_id
         self._group = group
-        self._transfers = transfers
-        self._maps = maps
-        self._log = log
-        self._estimator = estimator
         self._work = work
         self._outbox = Outbox(transfers)
         self._refusals = Refusals(log)
         self.trust = PeerTrust(
-            group, autopilot, log, self._refusals, self._turn_away, options.quarantine
+            group,
+            autopilot,
+            estimator,
+            log,
+            self._refusals,
+            lambda peer: self.inter.lost(peer),
+            options.quarantine,
         )
-        self._n_resets = 0
         self.clocks = PeerClocks(
             group,
             self._outbox.ask_time,
@@ -151,29 +147,10 @@ class Exchange:
             self.clocks,
             log,
             work,
-            self._hand_answer,
+            AnswerHearers(group, transfers, maps, self._outbox).hand,
             transfers.cancel,
             self._passed.hold,
             transfers.image_bytes,
-        )
-        self._rounds = MapRounds(
-            group,
-            self._frames,
-            maps,
-            self._answers.describe,
-            self._answers.detail,
-            self._outbox.send,
-            self.decide,
-            self._passed,
-            transfers.frames_carried_in_s,
-            lambda: transfers.is_receiving(BlobKind.MAP, self._now_s()),
-            lambda: self._sharing.merging.is_under_way,
-            log,
-            clock,
-            self.clocks,
-            work,
-            RoundOptions(options.map, options.update),
-            rng,
         )
         self._own_state = OwnState(
             group, maps, estimator, sensor, clock, log, options.update, self._outbox.send
@@ -193,6 +170,26 @@ class Exchange:
             len(options.detectors) > 1,
             estimator.carry,
             lambda: self._rounds.is_under_way,
+        )
+        self.results = RoundResults(group, maps, self._sharing.own_maps, self._outbox.send, log)
+        self._rounds = MapRounds(
+            group,
+            self._frames,
+            maps,
+            self._answers.describe,
+            self._answers.detail,
+            self._outbox.send,
+            self.results.decide,
+            self._passed,
+            transfers.frames_carried_in_s,
+            lambda: transfers.is_receiving(BlobKind.MAP, self._now_s()),
+            lambda: self._sharing.merging.is_under_way,
+            log,
+            clock,
+            self.clocks,
+            work,
+            RoundOptions(options.map, options.update),
+            rng,
         )
         self.inter = InterTarget(
             system_id,
@@ -276,26 +273,6 @@ class Exchange:
         if self._messages.take(tunnel):
             self._outbox.wake()
 
-    async def decide(
-        self, built: LandmarkMap | NoMap, instead_of: StoredMap | None, request_id: int
-    ) -> None:
-        """Fly on a map that was built and hand it out, or tell everybody why there is none.
-
-        Args:
-            built: what became of a round.
-            instead_of: the map in use when it began; None for a first map.
-            request_id: the round's.
-        """
-        if isinstance(built, LandmarkMap):
-            refused = await self._sharing.own_maps.adopt(built, instead_of)
-            if refused is None:
-                return
-            built = refused
-        refusal = MapRefused.because(request_id, built.reason)
-        for peer in self._group.peers:
-            self._outbox.send(refusal, peer)
-        self._no_map(built.reason)
-
     async def run(self) -> None:
         """Keep transfers, states and rounds going until cancelled; a failure in one ends all."""
         async with asyncio.TaskGroup() as parts:
@@ -305,7 +282,7 @@ class Exchange:
             parts.create_task(self._passed.run())
             parts.create_task(self._sharing.run())
             parts.create_task(self._inter_host.run())
-            parts.create_task(self._look_around())
+            parts.create_task(keep_place_known(self._group, self._frames, self._work))
             parts.create_task(self._keep_going())
 
     async def _keep_going(self) -> None:
@@ -316,56 +293,11 @@ class Exchange:
             if now_s >= looked_at_s + look_s(self._group.stretch - 1.0):
                 looked_at_s = now_s
                 self._presence.poll(now_s)
-            self._review()
+            self.trust.poll()
             self._own_state.poll(now_s)
             self._sharing.handing.hand_out(now_s)
             self._deliveries.take(self._outbox.poll())
             await self._outbox.pause(now_s)
-
-    async def _look_around(self) -> None:
-        """Have peers know by a signature, now and then, what place we see."""
-        seen: Frame | None = None
-        while self._group.peers:
-            await asyncio.sleep(_SIGNATURE_S)
-            newest = self._frames.newest
-            if newest is None or newest is seen:
-                continue
-            seen = newest
-            signature = await self._work.signature(np.asarray(newest.image))
-            self._group.note_signature(signature, self._now_s())
-
-    def _review(self) -> None:
-        """Let who was quarantined go when it is time, and poses that ours has come round to."""
-        if self._estimator.n_resets != self._n_resets:
-            self._n_resets = self._estimator.n_resets
-            self.trust.was_wrong()
-        self.trust.poll()
-
-    def _turn_away(self, peer: int) -> None:
-        """Wait for nothing of a peer that is not believed any more."""
-        self.inter.lost(peer)
-
-    def _no_map(self, reason: str) -> None:
-        """Note that a round gave no map; the one in use stays, if there is one."""
-        if self._maps.current is not None:
-            self._log.event("no update", reason)
-            _log.warning("no update of the map: %s", reason)
-            return
-        if reason != self._maps.refusal:
-            self._log.event("no map", reason)
-            _log.warning("no map: %s", reason)
-        self._maps.refuse(reason)
-
-    def _hand_answer(self, peer: int, blob: bytes) -> tuple[int, ...]:
-        """Send a frame to who has asked for it, and to all others where that costs nothing."""
-        hears = self._group.trusted_teammates if self._transfers.shares_network else ()
-        is_first = self._maps.current is None  # all are about to have one
-        others = [
-            m
-            for m in hears
-            if m not in (peer, self._system_id) and (is_first or self._group.has_map(m))
-        ]
-        return tuple(self._outbox.hand(BlobKind.FRAME_ANSWER, to, blob) for to in (peer, *others))
 
     def want_update(self, wanted: bool) -> None:
         """Want the map updated, or not any more, because the ground does."""

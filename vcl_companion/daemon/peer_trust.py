@@ -11,6 +11,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Mapping
 
+from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.refusals import Refusals
 from vcl_companion.errors import WireError
@@ -33,6 +34,7 @@ class PeerTrust:
     Args:
         group: told whose votes do not count.
         autopilot: told of every change, for the ground.
+        estimator: whose jumps say that it was our own pose that was off.
         log: likewise.
         refusals: counts what is not taken.
         turned_away: told whose answers nobody waits for any more.
@@ -43,6 +45,7 @@ class PeerTrust:
         self,
         group: Group,
         autopilot: AutopilotLink,
+        estimator: Estimator,
         log: FlightLog,
         refusals: Refusals,
         turned_away: Callable[[int], None],
@@ -50,10 +53,12 @@ class PeerTrust:
     ) -> None:
         self._group = group
         self._autopilot = autopilot
+        self._estimator = estimator
         self._log = log
         self._refusals = refusals
         self._turned_away = turned_away
         self._quarantine = Quarantine(options)
+        self._n_resets = 0
         self._unsaid: dict[int, tuple[Severity, str]] = {}
         self._said_at_s = float("-inf")
 
@@ -95,12 +100,15 @@ class PeerTrust:
         else:
             self.note(peer, Evidence.POSE_TAKEN)
 
-    def was_wrong(self) -> None:
-        """Hold no pose against anybody: our own has jumped, so it was not theirs that was off."""
-        self._quarantine.forgive(Evidence.POSE_CONTRADICTED)
-
     def poll(self) -> None:
-        """Release whose term is over, and say what has not been said; call it several times/s."""
+        """Release whose term is over, and say what has not been said; call it several times/s.
+
+        When our own pose has jumped no pose is held against anybody: it was not theirs that
+        was off.
+        """
+        if self._estimator.n_resets != self._n_resets:
+            self._n_resets = self._estimator.n_resets
+            self._quarantine.forgive(Evidence.POSE_CONTRADICTED)
         for released in self._quarantine.poll(self._now_s()):
             self._log.event("released", f"drone {released.peer}")
             _log.info("drone %d is believed again", released.peer)
