@@ -9,7 +9,7 @@ import numpy as np
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.geometry.similarity import Similarity
-from vcl_companion.localization.pose_filter import FilterState, carried
+from vcl_companion.localization.filter_state import FilterState, carried
 
 # A fix this old is no more where we are.
 FRESH_NS = 2_000_000_000

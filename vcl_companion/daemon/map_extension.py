@@ -14,7 +14,7 @@ from vcl_companion.mapping.novelty import NEAR_DEG
 from vcl_companion.mapping.options import NoMap
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.pace import look_s
-from vcl_companion.swarm.updates import UpdateOptions
+from vcl_companion.swarm.update_options import UpdateOptions
 from vcl_companion.wire.frame_codec import FrameAnswer
 
 Decide = Callable[[LandmarkMap | NoMap, StoredMap | None, int], Awaitable[None]]

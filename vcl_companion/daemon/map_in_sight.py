@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from contextlib import suppress
 
-from vcl_companion.localization.intra import Localized
+from vcl_companion.localization.fix import Localized
 
 # For so long what a frame shows counts as unknown while it is looked for by its features: a small
 # map is looked through by then.

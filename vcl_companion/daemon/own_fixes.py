@@ -13,9 +13,9 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot import AutopilotLink
-from vcl_companion.localization.intra import Localized, NotLocalized
+from vcl_companion.localization.filter_state import FilterState
+from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.localization.pipeline import Effort, PipelineOptions, is_doubtful, localize
-from vcl_companion.localization.pose_filter import FilterState
 from vcl_companion.recording.sensor import Sensor
 
 # How long an attitude sample may still be on its way when its frame is here.

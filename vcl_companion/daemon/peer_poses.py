@@ -12,8 +12,9 @@ from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.inter_target import Asked, InterTarget
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.localization.intra import NotLocalized
-from vcl_companion.localization.pose_filter import FilterState, NotFused
+from vcl_companion.localization.filter_state import FilterState
+from vcl_companion.localization.fix import NotLocalized
+from vcl_companion.localization.proposals import NotFused
 from vcl_companion.wire.pose_messages import PoseProposal
 
 
