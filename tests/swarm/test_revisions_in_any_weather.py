@@ -91,7 +91,7 @@ class Revisions(RuleBasedStateMachine):
         self.group.map_state(member, state, self.network.now_s)
 
     def hand_out(self) -> None:
-        """Hand the newest to those that lack it, as ``MapSharing`` does."""
+        """Hand the newest to those that lack it, as ``MapHanding`` does."""
         if not self.newest:
             return
         self.group.set_own_state(MapState(revision_of(self.newest), 0, True))
