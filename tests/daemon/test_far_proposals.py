@@ -18,14 +18,18 @@ SURE = np.diag([0.02] * 3 + [0.002] * 3) ** 2
 SPEED_M_S = FilterOptions().speed_m_s
 
 
+def fix_at(metres: float) -> Localized:
+    """A fix of the drone's own, so far along the x axis."""
+    return Localized(
+        Pose(np.eye(3), np.array([metres, 0.0, 0.0])), SURE, 1e-6 * np.eye(6), np.zeros((6, 0)),
+        np.zeros((0, 0)), 50, 50, False, 0.5,
+    )  # fmt: skip
+
+
 def after_a_fix(silent_s: float) -> tuple[Estimator, int]:
     """A drone that saw the map at the origin, and for so long nothing since."""
     estimator = Estimator(FilterOptions(), LocalizationOptions(), lambda _: None)
-    fix = Localized(
-        Pose.identity(), SURE, 1e-6 * np.eye(6), np.zeros((6, 0)), np.zeros((0, 0)),
-        50, 50, False, 0.5,
-    )  # fmt: skip
-    estimator.take_fix(None, fix, 0, None)
+    estimator.take_fix(None, fix_at(0.0), 0, None)
     at_ns = round(silent_s * 1e9)
     estimator.take_nothing(estimator.predicted(at_ns, None), at_ns, None)
     return estimator, at_ns
@@ -67,3 +71,15 @@ def test_a_drone_that_has_seen_nothing_yet_is_placed_by_its_peers() -> None:
     estimator = Estimator(FilterOptions(), LocalizationOptions(), lambda _: None)
     assert isinstance(proposed(estimator, 0, 900.0), FilterState)
     assert not estimator.last_own_fix.is_near(0)
+
+
+def test_a_fix_that_comes_late_says_where_a_drone_was_too() -> None:
+    """Where every frame has to be searched for, there are no others."""
+    estimator = Estimator(FilterOptions(), LocalizationOptions(), lambda _: None)
+    assert isinstance(proposed(estimator, 0, 0.0), FilterState)
+    for at_ns in (1_000_000_000, 2_000_000_000, 3_000_000_000):
+        estimator.take_nothing(estimator.predicted(at_ns, None), at_ns, None)
+    for at_ns in (2_000_000_000, 1_000_000_000):
+        assert isinstance(estimator.take_fix(None, fix_at(0.1), at_ns, None), FilterState)
+    assert estimator.last_own_fix.is_near(4_000_000_000)
+    assert not estimator.last_own_fix.is_near(4_000_000_001)

@@ -251,6 +251,8 @@ class Estimator:
         elif state.n_jumps > before.n_jumps:
             self._relocalized(fix)
         self._n_contradicted = 0
+        self._has_begun = True
+        self.last_own_fix.note(state)
         return state
 
     def take_proposal(

@@ -31,8 +31,9 @@ class LastOwnFix:
         self._state: FilterState | None = None
 
     def note(self, state: FilterState) -> None:
-        """Take the state after a frame that gave a fix."""
-        self._state = state
+        """Take the state after a frame that gave a fix; an older one changes nothing."""
+        if self._state is None or state.at_ns >= self._state.at_ns:
+            self._state = state
 
     def forget(self) -> None:
         """Know of none any more."""
