@@ -23,17 +23,10 @@ from tests.ports import free_ports
 from tests.whole_lines import json_lines
 from vcl_companion.recording import Description, RecordingWriter
 from vcl_companion.wire.map_codec import revision_of
-from vcl_companion.wire.warm_up import warm_up
 
 ROOT = Path(__file__).parents[2]
 N_FRAMES = 4
 BOUND_S = 30.0
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _compiled() -> None:
-    """Compile once, which takes a minute on a new machine: daemons load what that left."""
-    warm_up()
 
 
 @pytest.fixture(scope="module")

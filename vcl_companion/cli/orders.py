@@ -77,14 +77,55 @@ def _order(name: str, links: tuple[str, ...], drones: tuple[int, ...], within_s:
     click.get_current_context().exit(0 if is_done else 1)
 
 
-@ground.command("update-map")
-@_to_drones(within_s=90.0)
-def ground_update_map(links: tuple[str, ...], drones: tuple[int, ...], within_s: float) -> None:
+def _plain(name: str, within_s: float, help_text: str) -> None:
+    """Add the command of an order that takes no more than to whom it goes, and within what time."""
+
+    @ground.command(name, help=help_text)
+    @_to_drones(within_s)
+    def order(links: tuple[str, ...], drones: tuple[int, ...], within_s: float) -> None:
+        _order(name, links, drones, within_s)
+
+
+_plain(
+    "update-map",
+    90.0,
     """Have drones update their map now, and follow it to the end; Ctrl-C cancels it.
 
     Exit status: 0 when all of them have a new map, 1 when not, 2 when nobody is heard.
-    """
-    _order("update-map", links, drones, within_s)
+    """,
+)
+_plain(
+    "reload-map",
+    30.0,
+    """Have drones go back to the map that they have saved, and look for where they are in it.
+
+    Exit status: 0 when all of them fly on it, 1 when not, 2 when nobody is heard.
+    """,
+)
+_plain(
+    "relocalize",
+    30.0,
+    """Have drones forget where they are, and look for it anew.
+
+    Exit status: 0 when all of them do, 1 when not, 2 when nobody is heard.
+    """,
+)
+_plain(
+    "pause",
+    30.0,
+    """Have drones send their autopilots no poses, until they are resumed.
+
+    Exit status: 0 when all of them hold them back, 1 when not, 2 when nobody is heard.
+    """,
+)
+_plain(
+    "resume",
+    30.0,
+    """Have drones send their autopilots poses again.
+
+    Exit status: 0 when all of them do, 1 when not, 2 when nobody is heard.
+    """,
+)
 
 
 @ground.command("save-map")
@@ -98,43 +139,3 @@ def ground_save_map(
     Exit status: 0 when all of them have, 1 when not, 2 when nobody is heard.
     """
     _order("forget-map" if forget else "save-map", links, drones, within_s)
-
-
-@ground.command("reload-map")
-@_to_drones(within_s=30.0)
-def ground_reload_map(links: tuple[str, ...], drones: tuple[int, ...], within_s: float) -> None:
-    """Have drones go back to the map that they have saved, and look for where they are in it.
-
-    Exit status: 0 when all of them fly on it, 1 when not, 2 when nobody is heard.
-    """
-    _order("reload-map", links, drones, within_s)
-
-
-@ground.command("relocalize")
-@_to_drones(within_s=30.0)
-def ground_relocalize(links: tuple[str, ...], drones: tuple[int, ...], within_s: float) -> None:
-    """Have drones forget where they are, and look for it anew.
-
-    Exit status: 0 when all of them do, 1 when not, 2 when nobody is heard.
-    """
-    _order("relocalize", links, drones, within_s)
-
-
-@ground.command("pause")
-@_to_drones(within_s=30.0)
-def ground_pause(links: tuple[str, ...], drones: tuple[int, ...], within_s: float) -> None:
-    """Have drones send their autopilots no poses, until they are resumed.
-
-    Exit status: 0 when all of them hold them back, 1 when not, 2 when nobody is heard.
-    """
-    _order("pause", links, drones, within_s)
-
-
-@ground.command("resume")
-@_to_drones(within_s=30.0)
-def ground_resume(links: tuple[str, ...], drones: tuple[int, ...], within_s: float) -> None:
-    """Have drones send their autopilots poses again.
-
-    Exit status: 0 when all of them do, 1 when not, 2 when nobody is heard.
-    """
-    _order("resume", links, drones, within_s)
