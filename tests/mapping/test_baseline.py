@@ -22,6 +22,7 @@ from vcl_companion.vision.features import Detector, Features
 from vcl_companion.vision.resection import NotFound
 
 OPTIONS = MapOptions(detectors=("akaze",))
+LENGTH = MapOptions(max_error_px=1.0, max_depth_error=0.1)
 N_SEEN = 150
 
 
@@ -77,8 +78,7 @@ def test_the_length_is_that_of_most_landmarks(n_wrong: int) -> None:
         points[both],
         scene.ideal[both, 1],
         scene.camera.focal_px,
-        3.0,
-        0.1,
+        LENGTH,
     )
     assert not isinstance(found, NotFound)
     pose, agree = found
@@ -91,10 +91,10 @@ def test_landmarks_that_contradict_each_other_give_no_length() -> None:
     rng = np.random.default_rng(2)
     aside = Pose(np.eye(3), np.array([1.0, 0.0, 0.0]))
     points = rng.uniform([-3.0, -2.0, 4.0], [3.0, 2.0, 40.0], (20, 3))
-    found = with_length(aside, points, rng.uniform(-1, 1, (20, 2)), 320.0, 3.0, 0.1)
+    found = with_length(aside, points, rng.uniform(-1, 1, (20, 2)), 320.0, LENGTH)
     assert isinstance(found, NotFound)
     assert "agree on how long" in found.reason
-    few = with_length(aside, points[:5], np.zeros((5, 2)), 320.0, 3.0, 0.1)
+    few = with_length(aside, points[:5], np.zeros((5, 2)), 320.0, LENGTH)
     assert isinstance(few, NotFound)
     assert "6 needed" in few.reason
 
@@ -104,10 +104,17 @@ def test_a_length_that_landmarks_know_too_vaguely_is_none() -> None:
     aside = Pose(np.eye(3), np.array([1.0, 0.0, 0.0]))
     points = rng.uniform([-3.0, -2.0, 30.0], [3.0, 2.0, 40.0], (8, 3))
     seen = (points + aside.translation)[:, :2] / points[:, 2:] + rng.normal(0.0, 0.01, (8, 2))
-    found = with_length(aside, points, seen, 320.0, 9.0, 0.05)
+    found = with_length(
+        aside, points, seen, 320.0, replace(LENGTH, max_error_px=3.0, max_depth_error=0.05)
+    )
     assert isinstance(found, NotFound)
     assert "% only" in found.reason
-    assert not isinstance(with_length(aside, points, seen, 320.0, 9.0, 0.5), NotFound)
+    assert not isinstance(
+        with_length(
+            aside, points, seen, 320.0, replace(LENGTH, max_error_px=3.0, max_depth_error=0.5)
+        ),
+        NotFound,
+    )
 
 
 def late(rng: np.random.Generator, n_common: int, outliers: float) -> tuple[Scene, LandmarkMap]:

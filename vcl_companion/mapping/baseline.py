@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.mapping.culling import LOOSE
+from vcl_companion.mapping.options import MapOptions
 from vcl_companion.vision.information import robust_sigma
 from vcl_companion.vision.resection import NotFound
 
@@ -29,8 +31,7 @@ def with_length(
     points_a: Array,
     ideal_b: Array,
     focal_px: float,
-    limit_px: float,
-    max_error: float,
+    options: MapOptions,
 ) -> tuple[Pose, Mask] | NotFound:
     """Give a relative pose its length.
 
@@ -39,12 +40,13 @@ def with_length(
         points_a: (M, 3) landmarks, in camera a's coordinates.
         ideal_b: (M, 2) where camera b shows them, ideal image coordinates; wrong ones among them.
         focal_px: of camera b, px per ideal unit.
-        limit_px: who agrees misses its landmark by no more.
-        max_error: how vague the length may be, as a share of it, 1 sigma.
+        options: who agrees misses its landmark by no more than ``LOOSE`` times ``max_error_px``;
+            the length may be as vague as depths, by ``max_depth_error``.
 
     Returns:
         The pose in the landmarks' unit, and (M,) which of them agree; or why there is none.
     """
+    limit_px = LOOSE * options.max_error_px
     turned = points_a @ b_from_a.rotation.T
     rays = np.column_stack([ideal_b, np.ones(len(ideal_b))])
     # x (R p + s t) = 0 for the cross product with the ray x: one s of each landmark.
@@ -63,7 +65,7 @@ def with_length(
         return NotFound(f"{n} of {len(points_a)} landmarks agree on how long the baseline is")
     length = float(np.median(lengths[best]))
     vague = robust_sigma(lengths[best] - length) / np.sqrt(n) / length
-    if vague > max_error:
+    if vague > options.max_depth_error:
         return NotFound(f"{n} landmarks tell how long the baseline is to {100 * vague:.0f} % only")
     agreeing = _agree(length, b_from_a, turned, ideal_b, focal_px, limit_px)
     return Pose(b_from_a.rotation, length * b_from_a.translation), agreeing

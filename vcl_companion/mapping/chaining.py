@@ -6,12 +6,14 @@ landmark yet: what is mapped is what the drones before saw together (IV-C, IV-G)
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from vcl_companion.mapping.baseline import with_length
-from vcl_companion.mapping.culling import LOOSE
 from vcl_companion.mapping.drone_view import DroneView
+from vcl_companion.mapping.growth import view_of
 from vcl_companion.mapping.joining import Joined, contradiction
 from vcl_companion.mapping.known_features import KnownFeatures
-from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
+from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.tracks import PairMatches
 from vcl_companion.mapping.visibility import visibility_graph
@@ -45,8 +47,10 @@ def join_to_keyframe(
     if len(matches.a) < options.min_landmarks:
         return NotFound(f"{len(matches.a)} matches with a keyframe, {options.min_landmarks} needed")
     keyframe = known.keyframes[k]
-    pair = [_as_view(keyframe, shown), view]
-    edge = visibility_graph(pair, options, seed, {(0, 1): matches})[0, 1]
+    # The map's axes are the world's: its attitude is known.
+    attitude = keyframe.world_from_body.rotation
+    other = replace(view_of(keyframe), ned_from_body=attitude, features=shown.features)
+    edge = visibility_graph([other, view], options, seed, {(0, 1): matches})[0, 1]
     if not isinstance(edge.chosen, RelativePose):
         return NotFound(edge.chosen.reason)
     landmark = shown.landmark[edge.matches.a]
@@ -57,8 +61,7 @@ def join_to_keyframe(
         world_from_a.inverse().apply(known.points_world[links.a]),
         view.camera.ideal_from_pixels(view.pixels[links.b]),
         view.camera.focal_px,
-        LOOSE * options.max_error_px,
-        options.max_depth_error,
+        options,
     )
     if isinstance(found, NotFound):
         return found
@@ -68,16 +71,3 @@ def join_to_keyframe(
     if reason:
         return NotFound(reason)
     return Joined(world_from_body, PairMatches(links.a[agree], links.b[agree]))
-
-
-def _as_view(keyframe: Keyframe, shown: KnownFeatures) -> DroneView:
-    """Return a keyframe as a view whose attitude is known: the map's axes are the world's."""
-    return DroneView(
-        keyframe.drone_id,
-        keyframe.captured_at_ns,
-        keyframe.camera,
-        keyframe.body_from_cam,
-        keyframe.world_from_body.rotation,
-        keyframe.image_bytes,
-        shown.features,
-    )

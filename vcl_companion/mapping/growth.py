@@ -134,6 +134,20 @@ def keyframe_of(view: DroneView, world_from_body: Pose) -> Keyframe:
     )
 
 
+def view_of(keyframe: Keyframe) -> DroneView:
+    """Return a keyframe as the view that it was, where the map puts it, without its features."""
+    return DroneView(
+        keyframe.drone_id,
+        keyframe.captured_at_ns,
+        keyframe.camera,
+        keyframe.body_from_cam,
+        None,
+        keyframe.image_bytes,
+        (),
+        keyframe.world_from_body,
+    )
+
+
 def _adjusted(
     estimate: Views, n_old: int, limit_px: float, steps: int, options: MapOptions
 ) -> tuple[Views, Mask, float]:

@@ -164,9 +164,7 @@ def register_next(drones: list[DroneView], scene: Scene) -> Scene | None:
             continue
         found = refine(start, sightings, wanted)
         if not isinstance(found, NotFound):
-            ideal = scene.ideal.copy()
-            ideal[index[~found.inliers], i] = np.nan
-            return replace(scene, ideal=ideal, cams={**scene.cams, i: found.world_from_body})
+            return _registered(scene, i, found.world_from_body, index[~found.inliers])
     return None
 
 
@@ -191,13 +189,17 @@ def register_by_pair(
             scene.cams[a].inverse().apply(scene.points[index]),
             scene.ideal[index, b],
             drones[b].camera.focal_px,
-            LOOSE * options.max_error_px,
-            options.max_depth_error,
+            options,
         )
         if isinstance(found, NotFound):
             continue
         pose, agree = found
-        ideal = scene.ideal.copy()
-        ideal[index[~agree], b] = np.nan
-        return replace(scene, ideal=ideal, cams={**scene.cams, b: scene.cams[a] @ pose.inverse()})
+        return _registered(scene, b, scene.cams[a] @ pose.inverse(), index[~agree])
     return None
+
+
+def _registered(scene: Scene, i: int, cam: Pose, wrong: NDArray[np.intp]) -> Scene:
+    """Return the scene with a view in it, which does not see the landmarks that miss there."""
+    ideal = scene.ideal.copy()
+    ideal[wrong, i] = np.nan
+    return replace(scene, ideal=ideal, cams={**scene.cams, i: cam})

@@ -17,7 +17,7 @@ from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.aligning import Aligned, Side
 from vcl_companion.mapping.common_landmarks import shared_keyframes
 from vcl_companion.mapping.culling import Mask, depth_errors
-from vcl_companion.mapping.drone_view import DroneView
+from vcl_companion.mapping.growth import view_of
 from vcl_companion.mapping.known_features import Index
 from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance
 from vcl_companion.mapping.options import MapOptions
@@ -132,7 +132,7 @@ def _shown(
     out = np.full((len(known.points_world), len(brought), 2), np.nan)
     for i, keyframe in enumerate(brought):
         found = place(
-            _view(keyframe),
+            view_of(keyframe),
             len(cams) + i,
             keyframe.world_from_body,
             known,
@@ -145,19 +145,6 @@ def _shown(
         if not isinstance(found, NotFound):
             out[found.landmarks, i] = found.pixels
     return out
-
-
-def _view(keyframe: Keyframe) -> DroneView:
-    return DroneView(
-        keyframe.drone_id,
-        keyframe.captured_at_ns,
-        keyframe.camera,
-        keyframe.body_from_cam,
-        None,
-        keyframe.image_bytes,
-        (),
-        keyframe.world_from_body,
-    )
 
 
 def _explains(senior: Side, junior: Side, stands: Aligned) -> Callable[[Index, Index], Mask]:
