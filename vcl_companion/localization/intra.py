@@ -25,6 +25,7 @@ from vcl_companion.vision.resection import (
     Undecided,
     refine,
     search,
+    somewhere_alike,
 )
 
 _SURE_PX = 8.0
@@ -91,14 +92,16 @@ def localize_intra(
     if attempt is None or not guided:
         attempt = scene.whole_map()
     # Matched from nearby already, a second round would find the same again.
-    if isinstance(attempt.result, Resection) and not (guided and radius_px <= 2.0 * _SURE_PX):
+    first = attempt.result
+    if isinstance(first, Resection) and not (guided and radius_px <= 2.0 * _SURE_PX):
         limit = _LED_LEVERAGE if guided else _FOUND_LEVERAGE
-        again = scene.guided(attempt.result.world_from_body, _SURE_PX, limit)
-        if (
-            isinstance(again.result, Resection)
-            and again.result.inliers.sum() >= attempt.result.inliers.sum()
-        ):
-            attempt = again
+        again = scene.guided(first.world_from_body, _SURE_PX, limit)
+        if isinstance(again.result, Resection):
+            alike = somewhere_alike(again.result, _SURE_PX)
+            if alike is not None:
+                attempt = replace(attempt, result=alike)
+            elif again.result.inliers.sum() >= first.inliers.sum():
+                attempt = again
     return scene.judged(attempt, guided, ned_from_body)
 
 

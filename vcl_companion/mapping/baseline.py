@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import binom
 
+from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.culling import LOOSE
@@ -19,18 +21,17 @@ from vcl_companion.vision.resection import NotFound
 
 Mask = NDArray[np.bool_]
 
-# A wrong match that lies on its epipolar line agrees with a length once in a hundred: six of
-# twenty do by chance once in a million.
+# Fewer tell nothing, whatever they agree on.
 _LEAST = 6
-# Half of those that show a length must agree on it.
-_LEAST_SHARE = 0.5
+# So many lengths on which as many agree are expected of wrong matches alone.
+_BY_CHANCE = 1e-4
 
 
 def with_length(
     b_from_a: Pose,
     points_a: Array,
     ideal_b: Array,
-    focal_px: float,
+    camera_b: Camera,
     options: MapOptions,
 ) -> tuple[Pose, Mask] | NotFound:
     """Give a relative pose its length.
@@ -38,13 +39,16 @@ def with_length(
     Args:
         b_from_a: camera a's coordinates to camera b's, the translation of length 1.
         points_a: (M, 3) landmarks, in camera a's coordinates.
-        ideal_b: (M, 2) where camera b shows them, ideal image coordinates; wrong ones among them.
-        focal_px: of camera b, px per ideal unit.
+        ideal_b: (M, 2) where camera b shows them, ideal image coordinates; wrong ones among
+            them, on their epipolar lines or anywhere.
+        camera_b: its intrinsics.
         options: who agrees misses its landmark by no more than ``LOOSE`` times ``max_error_px``;
             the length may be as vague as depths, by ``max_depth_error``.
 
     Returns:
         The pose in the landmarks' unit, and (M,) which of them agree; or why there is none.
+        A length is believed when so many wrong matches, each anywhere on its epipolar line,
+        would hardly agree on one.
     """
     limit_px = LOOSE * options.max_error_px
     turned = points_a @ b_from_a.rotation.T
@@ -55,20 +59,52 @@ def with_length(
         lengths = -np.einsum("ni,ni->n", across_p, across_t) / np.einsum(
             "ni,ni->n", across_t, across_t
         )
-    tried = lengths[np.isfinite(lengths) & (lengths > 0.0)]
+    telling = np.isfinite(lengths) & (lengths > 0.0)
+    tried = lengths[telling]
     if len(tried) < _LEAST:
         return NotFound(f"{len(tried)} landmarks tell how long the baseline is, {_LEAST} needed")
+    focal_px = camera_b.focal_px
     agree = np.array([_agree(s, b_from_a, turned, ideal_b, focal_px, limit_px) for s in tried])
     best = agree[np.argmax(agree.sum(axis=1))]
     n = int(best.sum())
-    if n < max(_LEAST, _LEAST_SHARE * len(points_a)):
-        return NotFound(f"{n} of {len(points_a)} landmarks agree on how long the baseline is")
+    if (
+        n < _LEAST
+        or len(tried)
+        * _by_chance(n, len(tried), _windows(b_from_a, turned[telling], camera_b, limit_px))
+        > _BY_CHANCE
+    ):
+        return NotFound(f"{n} of {len(tried)} landmarks agree on how long the baseline is")
     length = float(np.median(lengths[best]))
     vague = robust_sigma(lengths[best] - length) / np.sqrt(n) / length
     if vague > options.max_depth_error:
         return NotFound(f"{n} landmarks tell how long the baseline is to {100 * vague:.0f} % only")
     agreeing = _agree(length, b_from_a, turned, ideal_b, focal_px, limit_px)
     return Pose(b_from_a.rotation, length * b_from_a.translation), agreeing
+
+
+def _by_chance(n: int, n_all: int, windows: Array) -> float:
+    """Return how likely so many agree with the length of one of them if all are wrong.
+
+    Each does with its own probability; as many with the mean of these do so no less often
+    (W. Hoeffding, On the distribution of the number of successes in independent trials, 1956).
+    """
+    return float(binom.sf(n - 2, n_all - 1, windows.mean()))
+
+
+def _windows(b_from_a: Pose, turned: Array, camera_b: Camera, limit_px: float) -> Array:
+    """Return (M,) what part of a landmark's epipolar line agrees with any one length.
+
+    The line runs from where the landmark is without a baseline to the epipole, or out of the
+    image: half of its diagonal, as a rule.
+    """
+    out_px = 0.5 * float(np.hypot(camera_b.width_px, camera_b.height_px))
+    towards = b_from_a.translation
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = turned[:, :2] / turned[:, 2:] - towards[:2] / towards[2]
+        line_px = np.linalg.norm(ends, axis=1) * camera_b.focal_px
+    ends_inside = (turned[:, 2] > 0.0) & (towards[2] > 0.0) & (line_px < out_px)
+    line_px = np.where(ends_inside, line_px, out_px)
+    return np.asarray(np.minimum(1.0, 2.0 * limit_px / np.maximum(line_px, limit_px)))
 
 
 def _agree(

@@ -8,22 +8,29 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
+from vcl_companion.geometry.pose import Pose
 from vcl_companion.mapping.baseline import with_length
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.growth import view_of
 from vcl_companion.mapping.joining import Joined, contradiction
 from vcl_companion.mapping.known_features import KnownFeatures
-from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.tracks import PairMatches
 from vcl_companion.mapping.visibility import visibility_graph
 from vcl_companion.vision.essential import RelativePose
+from vcl_companion.vision.guided_pairs import match_epipolar
 from vcl_companion.vision.resection import NotFound
+
+# How long a baseline may be, of the distance to the scene: least and largest.
+_BASELINES = (1e-3, 3.0)
 
 
 def join_to_keyframe(
     view: DroneView,
-    k: int,
+    keyframe: Keyframe,
     shown: KnownFeatures,
     matches: PairMatches,
     known: LandmarkMap,
@@ -34,7 +41,7 @@ def join_to_keyframe(
 
     Args:
         view: the view.
-        k: the keyframe, of the map.
+        keyframe: where it is, by the map.
         shown: its features.
         matches: features of the keyframe (``a``) and of the view (``b``), wrong ones among them.
         known: the map.
@@ -46,21 +53,20 @@ def join_to_keyframe(
     """
     if len(matches.a) < options.min_landmarks:
         return NotFound(f"{len(matches.a)} matches with a keyframe, {options.min_landmarks} needed")
-    keyframe = known.keyframes[k]
     # The map's axes are the world's: its attitude is known.
     attitude = keyframe.world_from_body.rotation
     other = replace(view_of(keyframe), ned_from_body=attitude, features=shown.features)
     edge = visibility_graph([other, view], options, seed, {(0, 1): matches})[0, 1]
     if not isinstance(edge.chosen, RelativePose):
         return NotFound(edge.chosen.reason)
-    landmark = shown.landmark[edge.matches.a]
-    links = PairMatches(landmark[landmark >= 0], edge.matches.b[landmark >= 0])
+    b_from_a = edge.chosen.b_from_a
+    links = _on_lines(shown, other, view, b_from_a)
     world_from_a = keyframe.world_from_body @ keyframe.body_from_cam
     found = with_length(
-        edge.chosen.b_from_a,
+        b_from_a,
         world_from_a.inverse().apply(known.points_world[links.a]),
         view.camera.ideal_from_pixels(view.pixels[links.b]),
-        view.camera.focal_px,
+        view.camera,
         options,
     )
     if isinstance(found, NotFound):
@@ -71,3 +77,34 @@ def join_to_keyframe(
     if reason:
         return NotFound(reason)
     return Joined(world_from_body, PairMatches(links.a[agree], links.b[agree]))
+
+
+def _on_lines(
+    shown: KnownFeatures, other: DroneView, view: DroneView, b_from_a: Pose
+) -> PairMatches:
+    """Match the landmarks that a keyframe shows along their epipolar lines in a view.
+
+    Of the whole image's features many resemble a landmark's; of those on its line, few.
+    """
+    none = np.zeros(0, np.intp)
+    landmarks, of_view, start_a, start_b = [none], [none], 0, 0
+    for mine, theirs in zip(shown.features, view.features, strict=True):
+        landmark = shown.landmark[start_a : start_a + len(mine)]
+        ideal_a = other.camera.ideal_from_pixels(mine.pixels)
+        ideal_b = view.camera.ideal_from_pixels(theirs.pixels)
+        a = np.flatnonzero((landmark >= 0) & np.isfinite(ideal_a[:, 0]))
+        b = np.flatnonzero(np.isfinite(ideal_b[:, 0]))
+        i, k, _ = match_epipolar(
+            mine.subset(a),
+            theirs.subset(b),
+            ideal_a[a],
+            ideal_b[b],
+            b_from_a,
+            _BASELINES,
+            view.camera.focal_px,
+        )
+        landmarks.append(landmark[a[i]])
+        of_view.append(start_b + b[k])
+        start_a += len(mine)
+        start_b += len(theirs)
+    return PairMatches(np.concatenate(landmarks), np.concatenate(of_view))

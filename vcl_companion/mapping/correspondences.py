@@ -7,6 +7,9 @@ overlap it most.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,8 +17,8 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.growth import Growth, Pairs
 from vcl_companion.mapping.joining import Joined
-from vcl_companion.mapping.known_features import KeyframeLibrary
-from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.known_features import KeyframeLibrary, KnownFeatures
+from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.partners import overlap
 from vcl_companion.mapping.tracks import PairMatches
 from vcl_companion.mapping.visibility import MutualMatches, match_features
@@ -24,6 +27,25 @@ from vcl_companion.mapping.visibility import MutualMatches, match_features
 _PARTNERS = 2
 # A keyframe that looks so much elsewhere is as good as one keyframe older.
 _DEG_PER_PLACE = 15.0
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbour:
+    """A view with a place, and what a waiting one shares with it.
+
+    Attributes:
+        name: of a keyframe of the old map, or of a view that has joined.
+        keyframe: where it is.
+        shown: its features, and whose landmarks they are.
+        matches: features of it (``a``) and of the waiting view (``b``).
+        growth: the map that its landmarks are of; None for the old one.
+    """
+
+    name: tuple[Literal["old", "joined"], int]
+    keyframe: Keyframe
+    shown: KnownFeatures
+    matches: PairMatches
+    growth: Growth | None
 
 
 class Correspondences:
@@ -117,6 +139,30 @@ class Correspondences:
         with np.errstate(invalid="ignore"):
             inside = (pixels > 0) & (pixels < (camera.width_px, camera.height_px))
         return np.asarray(inside.all(axis=1))
+
+    def neighbours(self, known: LandmarkMap, growth: Growth | None, i: int) -> list[Neighbour]:
+        """Return those that a waiting view is matched with already, most matches first.
+
+        Args:
+            known: the old map.
+            growth: the map so far; None for the old one.
+            i: the view.
+        """
+        found = [
+            Neighbour(("old", k), known.keyframes[k], self._library.of(k), matches, None)
+            for (k, mine), matches in self.pairs.with_keyframes.items()
+            if mine == i
+        ]
+        for column, k in enumerate(growth.views if growth is not None else ()):
+            m = self.pairs.with_views.get((min(i, k), max(i, k)))
+            if growth is None or m is None:
+                continue
+            view = self._views[k]
+            keyframe = growth.landmark_map.keyframes[len(known.keyframes) + column]
+            shown = KnownFeatures(view.features, view.pixels, growth.rows[k])
+            matches = m if k < i else PairMatches(m.b, m.a)
+            found.append(Neighbour(("joined", k), keyframe, shown, matches, growth))
+        return sorted(found, key=lambda one: -len(one.matches.a))
 
     def links(self, n_old: int, growth: Growth | None, i: int) -> PairMatches:
         """Return the landmarks that a waiting view's matches with all others lead to.

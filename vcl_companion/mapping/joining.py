@@ -23,6 +23,7 @@ from vcl_companion.vision.resection import (
     Sightings,
     refine,
     search,
+    somewhere_alike,
 )
 
 _MIN_INLIERS = 20
@@ -104,6 +105,8 @@ def join_nearby(
     result = refine(
         guess, sightings_of(view, links, known, sure), ResectionOptions(min_inliers=_MIN_INLIERS)
     )
+    if isinstance(result, Resection):
+        result = somewhere_alike(result, _GUIDED_PX) or result
     return believed(view, links, result, known, sure, options)
 
 

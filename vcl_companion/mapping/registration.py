@@ -62,7 +62,7 @@ class Registration:
         self._reasons: dict[int, str] = {}
         self._refuted: set[int] = set()
         self._grouped: set[int] = set()
-        self._paired: set[int] = set()
+        self._paired: set[tuple[int, tuple[str, int]]] = set()
 
     def run(self) -> Growth | NoMap:
         """Register view after view until no more can be; drop those that the whole refutes."""
@@ -94,7 +94,7 @@ class Registration:
                     return NoMap(str(error))
             if growth is not None and self._join_new(growth, known, sure):
                 continue
-            if self._join_pairs():
+            if self._join_pairs(growth):
                 continue
             if not self._join_groups(growth, known, sure):
                 break
@@ -152,22 +152,20 @@ class Registration:
         self._take(growth, found)
         return bool(found)
 
-    def _join_pairs(self) -> bool:
-        """Register waiting views by one keyframe each, each view once; whether any was."""
+    def _join_pairs(self, growth: Growth | None) -> bool:
+        """Register waiting views by what each shares with one other; whether any was."""
         some = False
         for i in self._waiting():
-            if i in self._paired:
-                continue
-            self._paired.add(i)
-            tried = [k for k, mine in self._matches.pairs.with_keyframes if mine == i]
-            tried.sort(key=lambda k: -len(self._matches.with_keyframe(k, i).a))
-            for k in tried[:_PAIRED]:
+            others = self._matches.neighbours(self._old, growth, i)
+            for other in [o for o in others if (i, o.name) not in self._paired][:_PAIRED]:
+                self._paired.add((i, other.name))
+                known = self._old if other.growth is None else other.growth.landmark_map
                 found = join_to_keyframe(
-                    self._views[i], k, self._library.of(k), self._matches.with_keyframe(k, i),
-                    self._old, self._options, self._seed,
+                    self._views[i], other.keyframe, other.shown, other.matches,
+                    known, self._options, self._seed,
                 )  # fmt: skip
                 if isinstance(found, Joined):
-                    self._joined[i] = found
+                    self._take(other.growth, {i: found})
                     some = True
                     break
                 self._reasons[i] = found.reason

@@ -188,7 +188,7 @@ def register_by_pair(
             b_from_a,
             scene.cams[a].inverse().apply(scene.points[index]),
             scene.ideal[index, b],
-            drones[b].camera.focal_px,
+            drones[b].camera,
             options,
         )
         if isinstance(found, NotFound):

@@ -101,6 +101,7 @@ class Resection:
         noise_covariance: (6, 6) from pixel noise alone, local perturbation (eq. 12).
         bias_covariance: (6, 6) from ``bias_px``, likewise.
         rms_px: of the inliers' reprojection errors.
+        median_px: of these errors' lengths.
     """
 
     world_from_body: Pose
@@ -111,6 +112,7 @@ class Resection:
     noise_covariance: Array
     bias_covariance: Array
     rms_px: float
+    median_px: float
 
 
 @dataclass(frozen=True)
@@ -200,6 +202,24 @@ def _converged(pose: Pose, sightings: Sightings) -> Pose | NotFound:
     return Pose(matrix[:, :3], matrix[:, 3])
 
 
+def somewhere_alike(found: Resection, radius_px: float) -> NotFound | None:
+    """Refuse a pose whose landmarks lie anywhere around where it puts them.
+
+    Where landmarks are vague, whatever resembles them nearby agrees. Of wrong matches, which lie
+    anywhere within the radius, a quarter are within half of it; of a place that is right most are.
+
+    Args:
+        found: the pose, by landmarks looked for near where it, or one close to it, puts them.
+        radius_px: how far from there they were looked for.
+
+    Returns:
+        Why it is none; None for a place that is right.
+    """
+    if found.median_px < 0.5 * radius_px:
+        return None
+    return NotFound("landmarks lie anywhere around where they should: somewhere alike")
+
+
 def _supported(
     pose: Pose, sightings: Sightings, usable: Mask, options: ResectionOptions
 ) -> Resection | NotFound:
@@ -218,6 +238,7 @@ def _supported(
         return NotFound("the matched landmarks do not fix a pose")
     gain = np.einsum("ij,njk->nik", inverse, weighted)
     by_landmark = gain @ np.swapaxes(gain, 1, 2)
+    error_px = np.linalg.norm(residual[inliers], axis=1)
     return Resection(
         pose,
         np.asarray(inliers),
@@ -226,7 +247,8 @@ def _supported(
         j_point[inliers],
         _ROBUST_LOSS * by_landmark.sum(axis=0) * sightings.noise_px**2,
         _ROBUST_LOSS * np.einsum("nij,n->ij", by_landmark, sightings.bias_px[inliers] ** 2),
-        float(np.sqrt((residual[inliers] ** 2).sum(axis=1).mean())),
+        float(np.sqrt((error_px**2).mean())),
+        float(np.median(error_px)),
     )
 
 
