@@ -282,7 +282,6 @@ class Companion:
         Not when the autopilot has heard of a later frame: a pose of the past that
         nobody has measured is no news.
         """
-        self._health.refused(why.reason)
         at_ns = frame.captured_at_ns
         state = self._estimator.coasted_at(at_ns)
         coasted = state is not None and self._teller.tell(state, at_ns) is None

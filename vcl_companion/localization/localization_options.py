@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from vcl_companion.options import require_positive
 from vcl_companion.vision.features import Detector
 
 
@@ -40,7 +41,8 @@ class LocalizationOptions:
     def __post_init__(self) -> None:
         if self.min_inliers < 6:
             raise ValueError(f"min_inliers must be at least 6, got {self.min_inliers}")
-        for name in (
+        require_positive(
+            self,
             "guided_radius_px",
             "noise_floor_px",
             "max_sigma_m",
@@ -48,9 +50,7 @@ class LocalizationOptions:
             "max_heading_deg",
             "bias_px_per_deg",
             "bias_px_per_octave",
-        ):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        )
 
     def of_any_heading(self) -> LocalizationOptions:
         """Return the same where the autopilot's heading says nothing of the map's north."""

@@ -18,6 +18,7 @@ from vcl_companion.geometry.rotation import Array, about_down, heading_of, log_s
 from vcl_companion.localization.jackknife import jackknife, no_less_than
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.mapping.lens_errors import lens_px
+from vcl_companion.options import require_positive
 from vcl_companion.vision.bundle import linearized
 from vcl_companion.vision.epipolar import signed_sampson
 from vcl_companion.vision.features import Features
@@ -64,16 +65,15 @@ class InterOptions:
     def __post_init__(self) -> None:
         if self.min_matches < 12 or self.min_common < 4:
             raise ValueError("inter-MAV needs min_matches >= 12 and min_common >= 4")
-        for name in (
+        require_positive(
+            self,
             "max_scale_spread",
             "attitude_sigma_deg",
             "tilt_sigma_deg",
             "noise_floor_px",
             "bias_px_per_deg",
             "max_sigma_m",
-        ):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,6 +24,7 @@ from vcl_companion.localization.filter_state import (
     kalman_step,
 )
 from vcl_companion.localization.fix import Localized, NotLocalized
+from vcl_companion.options import require_positive
 
 _MAX_COAST_S = 60.0
 
@@ -52,15 +53,14 @@ class FilterOptions:
     coast_s: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in (
+        require_positive(
+            self,
             "acceleration_m_s2",
             "speed_m_s",
             "attitude_sigma_deg",
             "attitude_drift_deg_s",
             "turn_rate_deg_s",
-        ):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        )
         if not 0 <= self.attitude_turn_error < 1:
             raise ValueError(
                 f"attitude_turn_error must lie in [0, 1), got {self.attitude_turn_error}"

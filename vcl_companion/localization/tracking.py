@@ -17,6 +17,7 @@ from vcl_companion.localization.patch_pose import PatchPoses
 from vcl_companion.mapping.lens_errors import lens_px
 from vcl_companion.mapping.novelty import novelty_deg
 from vcl_companion.mapping.templates import Templates
+from vcl_companion.options import require_positive
 from vcl_companion.vision.features import Image
 from vcl_companion.vision.information import covariance_of
 from vcl_companion.vision.patches import (
@@ -88,7 +89,8 @@ class TrackingOptions:
         for name in ("least_score", "coarse_score"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise ValueError(f"{name} must lie in (0, 1), got {getattr(self, name)}")
-        for name in (
+        require_positive(
+            self,
             "max_radius_px",
             "grey_noise",
             "misplaced_px",
@@ -97,9 +99,7 @@ class TrackingOptions:
             "misplaced_by_residual",
             "shifted_px",
             "mounted_m",
-        ):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        )
 
     def choice(self) -> ChoiceRules:
         """Return what an alignment is worth."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from vcl_companion.mapping.keyframe_image import ImageFormat
+from vcl_companion.options import require_positive
 from vcl_companion.vision.av1_image import can_av1
 from vcl_companion.vision.features import Detector
 
@@ -86,7 +87,8 @@ class MapOptions:
             raise ValueError(
                 f"max_landmarks must lie in min_landmarks..16000, got {self.max_landmarks}"
             )
-        for name in (
+        require_positive(
+            self,
             "min_angle_deg",
             "max_error_px",
             "attitude_sigma_deg",
@@ -94,9 +96,7 @@ class MapOptions:
             "max_depth_error",
             "member_wait_s",
             "gather_timeout_s",
-        ):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        )
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
+from vcl_companion.options import require_positive
+
 
 class Evidence(enum.Enum):
     """What a peer has said that speaks against it, or for it."""
@@ -67,9 +69,15 @@ class QuarantineOptions:
     flood_per_s: int = 50
 
     def __post_init__(self) -> None:
-        for name in ("threshold", "window_s", "first_s", "longest_s", "forgotten_s", "flood_per_s"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        require_positive(
+            self,
+            "threshold",
+            "window_s",
+            "first_s",
+            "longest_s",
+            "forgotten_s",
+            "flood_per_s",
+        )
         if not self.least_interval_s >= 0:
             raise ValueError(f"least_interval_s must not be negative, got {self.least_interval_s}")
 
