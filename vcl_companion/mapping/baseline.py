@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
@@ -88,7 +88,7 @@ def _by_chance(n: int, n_all: int, windows: Array) -> float:
     Each does with its own probability; as many with the mean of these do so no less often
     (W. Hoeffding, On the distribution of the number of successes in independent trials, 1956).
     """
-    return float(binom.sf(n - 2, n_all - 1, windows.mean()))
+    return float(bdtrc(n - 2, n_all - 1, windows.mean()))
 
 
 def _windows(b_from_a: Pose, turned: Array, camera_b: Camera, limit_px: float) -> Array:
