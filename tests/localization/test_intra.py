@@ -100,6 +100,21 @@ def test_without_noise_the_pose_is_exact(
     assert fix.rms_px < 1e-4
 
 
+def test_features_anywhere_around_vague_landmarks_are_no_place(
+    rng: np.random.Generator, relief: tuple[MapIndex, Descriptors]
+) -> None:
+    index, descriptors = relief
+    # Half a metre, 12 m away: more than the eight pixels within which they are looked for.
+    vague = replace(index, landmark_covariances=index.landmark_covariances + 0.5**2 * np.eye(3))
+    features = seen_from(rng, index.landmark_map, descriptors, TRUTH)
+    located(features, vague)
+    angle, radius = rng.uniform(0, 2 * np.pi, len(features)), np.sqrt(rng.random(len(features)))
+    off_px = 7.0 * radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    found = localize(replace(features, pixels=features.pixels + off_px), vague)
+    assert isinstance(found, NotLocalized)
+    assert "somewhere alike" in found.reason
+
+
 @pytest.mark.parametrize("camera", [RADIAL_TANGENTIAL], ids=["distorted"])
 def test_a_distorted_camera_is_as_exact(rng: np.random.Generator, camera: Camera) -> None:
     index, descriptors = index_of_scene(rng, facade_scene(rng, 250, 4.0, camera=camera))

@@ -67,12 +67,8 @@ def with_length(
     agree = np.array([_agree(s, b_from_a, turned, ideal_b, focal_px, limit_px) for s in tried])
     best = agree[np.argmax(agree.sum(axis=1))]
     n = int(best.sum())
-    if (
-        n < _LEAST
-        or len(tried)
-        * _by_chance(n, len(tried), _windows(b_from_a, turned[telling], camera_b, limit_px))
-        > _BY_CHANCE
-    ):
+    windows = _windows(b_from_a, turned[telling], camera_b, limit_px)
+    if n < _LEAST or _by_chance(n, windows) > _BY_CHANCE:
         return NotFound(f"{n} of {len(tried)} landmarks agree on how long the baseline is")
     length = float(np.median(lengths[best]))
     vague = robust_sigma(lengths[best] - length) / np.sqrt(n) / length
@@ -82,13 +78,15 @@ def with_length(
     return Pose(b_from_a.rotation, length * b_from_a.translation), agreeing
 
 
-def _by_chance(n: int, n_all: int, windows: Array) -> float:
-    """Return how likely so many agree with the length of one of them if all are wrong.
+def _by_chance(n: int, windows: Array) -> float:
+    """Return on how many of their lengths so many of M landmarks agree if all are wrong.
 
-    Each does with its own probability; as many with the mean of these do so no less often
-    (W. Hoeffding, On the distribution of the number of successes in independent trials, 1956).
+    Each agrees with its own probability, one of (M,) windows; as many with the mean of these do so
+    no less often (W. Hoeffding, On the distribution of the number of successes in independent
+    trials, 1956).
     """
-    return float(bdtrc(n - 2, n_all - 1, windows.mean()))
+    n_all = len(windows)
+    return n_all * float(bdtrc(n - 2, n_all - 1, windows.mean()))
 
 
 def _windows(b_from_a: Pose, turned: Array, camera_b: Camera, limit_px: float) -> Array:

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.mapping.baseline import with_length
 from vcl_companion.mapping.drone_view import DroneView
@@ -60,7 +61,7 @@ def join_to_keyframe(
     if not isinstance(edge.chosen, RelativePose):
         return NotFound(edge.chosen.reason)
     b_from_a = edge.chosen.b_from_a
-    links = _on_lines(shown, other, view, b_from_a)
+    links = _on_lines(shown, keyframe.camera, view, b_from_a)
     world_from_a = keyframe.world_from_body @ keyframe.body_from_cam
     found = with_length(
         b_from_a,
@@ -79,9 +80,7 @@ def join_to_keyframe(
     return Joined(world_from_body, PairMatches(links.a[agree], links.b[agree]))
 
 
-def _on_lines(
-    shown: KnownFeatures, other: DroneView, view: DroneView, b_from_a: Pose
-) -> PairMatches:
+def _on_lines(shown: KnownFeatures, camera: Camera, view: DroneView, b_from_a: Pose) -> PairMatches:
     """Match the landmarks that a keyframe shows along their epipolar lines in a view.
 
     Of the whole image's features many resemble a landmark's; of those on its line, few.
@@ -90,7 +89,7 @@ def _on_lines(
     landmarks, of_view, start_a, start_b = [none], [none], 0, 0
     for mine, theirs in zip(shown.features, view.features, strict=True):
         landmark = shown.landmark[start_a : start_a + len(mine)]
-        ideal_a = other.camera.ideal_from_pixels(mine.pixels)
+        ideal_a = camera.ideal_from_pixels(mine.pixels)
         ideal_b = view.camera.ideal_from_pixels(theirs.pixels)
         a = np.flatnonzero((landmark >= 0) & np.isfinite(ideal_a[:, 0]))
         b = np.flatnonzero(np.isfinite(ideal_b[:, 0]))

@@ -153,15 +153,15 @@ class Correspondences:
             for (k, mine), matches in self.pairs.with_keyframes.items()
             if mine == i
         ]
-        for column, k in enumerate(growth.views if growth is not None else ()):
-            m = self.pairs.with_views.get((min(i, k), max(i, k)))
-            if growth is None or m is None:
-                continue
-            view = self._views[k]
-            keyframe = growth.landmark_map.keyframes[len(known.keyframes) + column]
-            shown = KnownFeatures(view.features, view.pixels, growth.rows[k])
-            matches = m if k < i else PairMatches(m.b, m.a)
-            found.append(Neighbour(("joined", k), keyframe, shown, matches, growth))
+        if growth is not None:
+            keyframes = growth.landmark_map.keyframes[len(known.keyframes) :]
+            for k, keyframe in zip(growth.views, keyframes, strict=True):
+                m = self.pairs.with_views.get((min(i, k), max(i, k)))
+                if m is not None:
+                    view = self._views[k]
+                    shown = KnownFeatures(view.features, view.pixels, growth.rows[k])
+                    matches = m if k < i else PairMatches(m.b, m.a)
+                    found.append(Neighbour(("joined", k), keyframe, shown, matches, growth))
         return sorted(found, key=lambda one: -len(one.matches.a))
 
     def links(self, n_old: int, growth: Growth | None, i: int) -> PairMatches:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from vcl_companion.localization.pair_evidence import InterOptions
+from vcl_companion.options import require_positive
 from vcl_companion.swarm.group import Group
 from vcl_companion.vision.features import Detector
 
@@ -47,8 +48,7 @@ class InterMavOptions(InterOptions):
             raise ValueError(f"every_n_frames must lie in 0..100000, got {self.every_n_frames}")
         if not 0 <= self.least_interval_s <= 3600.0:
             raise ValueError(f"least_interval_s must lie in 0..3600, got {self.least_interval_s}")
-        if not self.weak_sigma_m > 0:
-            raise ValueError(f"weak_sigma_m must be positive, got {self.weak_sigma_m}")
+        require_positive(self, "weak_sigma_m")
         if not 0 < self.wait_s <= 60.0:
             raise ValueError(f"wait_s must be above 0 up to 60, got {self.wait_s}")
         if not 1 <= self.max_hosts <= 16:

@@ -70,13 +70,7 @@ class QuarantineOptions:
 
     def __post_init__(self) -> None:
         require_positive(
-            self,
-            "threshold",
-            "window_s",
-            "first_s",
-            "longest_s",
-            "forgotten_s",
-            "flood_per_s",
+            self, "threshold", "window_s", "first_s", "longest_s", "forgotten_s", "flood_per_s"
         )
         if not self.least_interval_s >= 0:
             raise ValueError(f"least_interval_s must not be negative, got {self.least_interval_s}")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.options import require_positive
 from vcl_companion.vision.absolute_pose import resect
 from vcl_companion.vision.acransac import AcRansacOptions
 from vcl_companion.vision.acransac import NotFound as NotFound
@@ -79,8 +80,7 @@ class Sightings:
     bias_px: Array
 
     def __post_init__(self) -> None:
-        if not self.noise_px > 0:
-            raise ValueError(f"noise_px must be positive, got {self.noise_px}")
+        require_positive(self, "noise_px")
 
     def usable(self) -> Mask:
         """Return (M,) which sightings are finite: a pixel may be none the lens can produce."""
