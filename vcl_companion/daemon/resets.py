@@ -28,6 +28,10 @@ _NOISE_M, _NOISE_RAD = 0.05, math.radians(2.0)
 # As many as PX4 follows of itself in the air.
 _MOST_RESETS = 5
 _WITHIN_NS = 60_000_000_000
+# After so long a slide is as fast as it gets, and so long before its end it begins to slow down. An
+# autopilot feels no such motion: it swings about one that begins or ends at once, by 0.2 m where
+# an ArduCopter's slides at 0.3 m/s, by 0.06 m so.
+_REACHES_SPEED_S = 6.0
 
 
 class Resets:
@@ -52,6 +56,7 @@ class Resets:
         self._is_allowed = False
         self._shift: Pose | None = None
         self._shifted_at_ns = 0
+        self._now_m_s = self._now_rad_s = 0.0
         self.n_resets = 0
         """Jumps that the autopilot is told of by ``reset_counter``."""
         self.waits_for = ""
@@ -112,6 +117,7 @@ class Resets:
             return self._wait(f"relocalized{away}: MAV_CMD_USER_4, or another flight mode")
         elif not may_move and expected is not None:
             self._shift, self._shifted_at_ns = _shift_between(expected, pose), at_ns
+            self._now_m_s = self._now_rad_s = 0.0
             self._say(f"relocalized{away}: told poses slide there", True)
             self._go_on(n_jumps)
         elif mode.is_armed and len(self._recent) == _MOST_RESETS:
@@ -127,10 +133,13 @@ class Resets:
         since_s = max(at_ns - self._shifted_at_ns, 0) * 1e-9
         shift = self._shift
         before = shift @ pose
-        turn_rad = _towards_zero(_heading(shift.rotation), self._turn_rad_s * since_s)
+        turn_rad = _heading(shift.rotation)
+        self._now_rad_s = _speed(self._now_rad_s, self._turn_rad_s, abs(turn_rad), since_s)
+        turn_rad = _towards_zero(turn_rad, self._now_rad_s * since_s)
         off = before.translation - pose.translation
         length_m = float(np.linalg.norm(off))
-        left_m = _towards_zero(length_m, self._speed_m_s * since_s)
+        self._now_m_s = _speed(self._now_m_s, self._speed_m_s, length_m, since_s)
+        left_m = _towards_zero(length_m, self._now_m_s * since_s)
         slid = off * (left_m / length_m) if length_m > 0.0 else off
         rotation = about_down(turn_rad)
         self._shift = Pose(rotation, pose.translation + slid - rotation @ pose.translation)
@@ -195,6 +204,13 @@ def _metres(pose: Pose, other: Pose) -> float:
 
 def _towards_zero(value: float, step: float) -> float:
     return math.copysign(max(abs(value) - step, 0.0), value) if abs(value) > step else 0.0
+
+
+def _speed(now: float, most: float, left: float, since_s: float) -> float:
+    """Return how fast a slide is, so long after it was as fast as ``now``, with so far to go."""
+    change = most / _REACHES_SPEED_S
+    half = 0.5 * change * since_s
+    return min(now + 2.0 * half, most, math.sqrt(half**2 + 2.0 * change * left) - half)
 
 
 def _heading(rotation: Array) -> float:
