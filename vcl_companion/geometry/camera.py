@@ -102,10 +102,14 @@ class Camera:
         What weighs a residual of ideal coordinates as the detector's noise does:
         towards the edge of a wide lens a pixel is many times as large there.
         """
-        if self.distortion_model == "none":
+        if self._is_undistorted:
             slopes = np.zeros((len(ideal), 2, 2))
             slopes[:, 0, 0], slopes[:, 1, 1] = self.fx_px, self.fy_px
             return slopes
+        if self.distortion_model == "radial-tangential":
+            slopes = self._radial_tangential_slopes(ideal) * [[self.fx_px], [self.fy_px]]
+            slopes[(ideal**2).sum(axis=1) >= self._fold_r2] = np.nan
+            return np.asarray(slopes)
         step = 1e-6
         columns = [
             (self.pixels_from_ideal(ideal + shift) - self.pixels_from_ideal(ideal - shift))
@@ -124,12 +128,17 @@ class Camera:
             self.fx_px,
             self.fy_px,
         )
-        if self.distortion_model == "none":
+        if self._is_undistorted:
             return np.asarray(distorted)
         with np.errstate(all="ignore"):  # rows without a solution run away and end as NaN
             if self.distortion_model == "equidistant":
                 return self._ideal_from_equidistant(distorted)
             return self._ideal_from_radial_tangential(distorted)
+
+    @cached_property
+    def _is_undistorted(self) -> bool:
+        """Whether the lens is a pinhole: of the equidistant model none is."""
+        return self.distortion_model != "equidistant" and not any(self.distortion)
 
     @cached_property
     def _fold_r2(self) -> float:
@@ -153,33 +162,37 @@ class Camera:
         return float(np.tan(np.sqrt(square)) ** 2) if square < (np.pi / 2) ** 2 else np.inf
 
     def _ideal_from_radial_tangential(self, distorted: Array) -> Array:
-        """Invert by Newton's method with a numeric Jacobian; NaN where it does not converge."""
+        """Invert by Newton's method; NaN where it does not converge."""
         ideal = distorted.copy()
-        step = 1e-6
         for _ in range(20):
             error = self._distorted(ideal) - distorted
             if not np.any(np.abs(error) >= 1e-12):
                 break
-            dx, dy = (
-                (self._distorted(ideal + shift) - self._distorted(ideal - shift)) / (2 * step)
-                for shift in (np.array([step, 0.0]), np.array([0.0, step]))
-            )
-            determinant = dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]
-            ideal = ideal - np.stack(
-                [
-                    (dy[:, 1] * error[:, 0] - dy[:, 0] * error[:, 1]) / determinant,
-                    (dx[:, 0] * error[:, 1] - dx[:, 1] * error[:, 0]) / determinant,
-                ],
-                axis=1,
-            )
+            (a, b), (c, d) = np.moveaxis(self._radial_tangential_slopes(ideal), 0, 2)
+            x, y = error[:, 0], error[:, 1]
+            step = np.stack([d * x - b * y, a * y - c * x], axis=1)
+            ideal = ideal - step / (a * d - b * c)[:, None]
         good = np.abs(self._distorted(ideal) - distorted).max(axis=1) < 1e-8
         good &= (ideal**2).sum(axis=1) < self._fold_r2
         ideal[~good] = np.nan
         return ideal
 
+    def _radial_tangential_slopes(self, ideal: Array) -> Array:
+        """Return (N, 2, 2) d(distorted) / d(ideal) at (N, 2) ideal coordinates."""
+        k1, k2, p1, p2, k3 = (*self.distortion, 0.0)[:5]
+        x, y = ideal[:, 0], ideal[:, 1]
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        growth = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+        out = np.empty((len(ideal), 2, 2))
+        out[:, 0, 0] = radial + x * x * growth + 2.0 * p1 * y + 6.0 * p2 * x
+        out[:, 0, 1] = out[:, 1, 0] = x * y * growth + 2.0 * p1 * x + 2.0 * p2 * y
+        out[:, 1, 1] = radial + y * y * growth + 6.0 * p1 * y + 2.0 * p2 * x
+        return out
+
     def _distorted(self, ideal: Array) -> Array:
         """Return (N, 2) distorted normalised coordinates of (N, 2) ideal ones."""
-        if self.distortion_model == "none":
+        if self._is_undistorted:
             return ideal
         x, y = ideal[:, 0], ideal[:, 1]
         r2 = x * x + y * y

@@ -24,9 +24,17 @@ from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.lens_errors import lenses_px, n_lens_causes
 from vcl_companion.mapping.misplacement import N_FIELDS, noise_px, smooth_px
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
-from vcl_companion.vision.bundle import Distance, Views, normal_equations
+from vcl_companion.vision.bundle import (
+    Distance,
+    Views,
+    distance_information,
+    matrices_of,
+    observations_of,
+)
+from vcl_companion.vision.compiled import writable
 from vcl_companion.vision.information import covariance_of
-from vcl_companion.vision.schur import carried, eliminated
+from vcl_companion.vision.joint_kernels import joined, without_points
+from vcl_companion.vision.schur import carried
 
 # Smallest eigenvalue of an information matrix with ones on its diagonal; eliminating
 # landmarks of little parallax leaves 1e-12 by rounding.
@@ -34,9 +42,9 @@ _SINGULAR = 1e-11
 _WIDER = 3.5
 # No distance between drones is known better; much smaller sigmas overflow.
 _FINEST_M = 1e-6
-# So many landmarks are dealt with at a time: on its way what is known of one takes ten times the
-# memory that it takes in the end.
-_AT_A_TIME = 192
+# So many landmarks are dealt with at a time: on its way what is known of one takes several times
+# the memory that it takes in the end.
+_AT_A_TIME = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,28 +124,32 @@ def map_uncertainty(landmark_map: LandmarkMap, calibration_px: float = 0.0) -> M
     inverse = np.empty((n, 3, 3))
     # In the order in which compiled loops were compiled for it. It is the largest part of a
     # map of many keyframes, and a millionth of it is no matter.
-    lever = np.empty((n, 3, 6 * n_keyframes), dtype=np.float32)
-    reduced = np.zeros((6 * n_keyframes, 6 * n_keyframes))
+    lever = np.zeros((n, 3, 6 * n_keyframes), dtype=np.float32)
+    reduced = distance_information(views_of(_of(landmark_map, slice(0, 0))))
     n_causes = N_FIELDS + (n_lens_causes(landmark_map) if calibration_px else 0)
     pulls = np.zeros((6 * n_keyframes, n_causes))
+    bodies = matrices_of([k.world_from_body for k in landmark_map.keyframes])
+    mountings = matrices_of([k.body_from_cam for k in landmark_map.keyframes])
     with np.errstate(all="ignore"):
-        # Distances enter in units of their own sigma; pixels in px: bring both to sigmas.
         for some in _portions(n):
             part = _of(landmark_map, some)
-            views = views_of(part)
-            noise = noise_px(part)
-            scaled = replace(views, slopes=views.slopes / noise[..., None, None])
-            sees = part.seen
-            alike = (
-                errors_px / noise[sees[:, i], i, None, None]
-                for i, errors_px in enumerate(_common_px(part, calibration_px))
+            seen, views = part.seen, views_of(part)
+            first, view = observations_of(seen)
+            noise = noise_px(part)[seen][:, None, None]
+            errors = np.empty((len(view), 2, n_causes))
+            for i, errors_px in enumerate(_common_px(part, calibration_px)):
+                errors[view == i] = errors_px / noise[view == i]
+            # Pixels in units of their own sigma, as distances are.
+            normal, of_points, crosses, view_pulls, point_pulls = joined(
+                writable(part.points_world), bodies, mountings, first, view,
+                views.slopes[seen] / noise, views.ideal[seen], errors,
+            )  # fmt: skip
+            inverse[some] = _inverse(of_points)
+            without_points(
+                first, view, crosses, inverse[some], point_pulls, normal, view_pulls, lever[some]
             )
-            system = normal_equations(scaled, None, alike, n_causes)
-            inverse[some] = _inverse(system.point_block)
-            lever[some] = -np.swapaxes(system.cross @ inverse[some], 1, 2)
-            reduced += system.pose_block - eliminated(system.cross, inverse[some], system.seen)
-            moved = inverse[some] @ system.point_pull
-            pulls += system.pose_pull - np.tensordot(system.cross, moved, axes=((0, 2), (0, 1)))
+            reduced += normal
+            pulls += view_pulls
         covariance = np.zeros_like(reduced)
         covariance[6:, 6:] = _inverse(reduced[6:, 6:])
         # An adjustment that knows nothing of what errs in common is moved by it: considered, not
@@ -146,8 +158,8 @@ def map_uncertainty(landmark_map: LandmarkMap, calibration_px: float = 0.0) -> M
         covariance += carried_off @ carried_off.T
         if landmark_map.anchor_covariance.any():
             # Whatever the first keyframe is off by, all are, and so are the landmarks.
-            bodies = [keyframe.world_from_body for keyframe in landmark_map.keyframes]
-            as_first = np.vstack([adjoint(body.inverse() @ bodies[0]) for body in bodies])
+            poses = [keyframe.world_from_body for keyframe in landmark_map.keyframes]
+            as_first = np.vstack([adjoint(pose.inverse() @ poses[0]) for pose in poses])
             covariance += as_first @ landmark_map.anchor_covariance @ as_first.T
     if not np.all(np.isfinite(covariance)):
         raise ValueError("the map's observations do not fix it")
@@ -165,12 +177,11 @@ def _common_px(landmark_map: LandmarkMap, calibration_px: float) -> Iterator[Arr
 
 
 def _of(landmark_map: LandmarkMap, some: slice) -> LandmarkMap:
-    """Return some landmarks of a map, the distances with the first of them only."""
+    """Return a map of some of its landmarks."""
     return replace(
         landmark_map,
         points_world=landmark_map.points_world[some],
         observed_px=landmark_map.observed_px[some],
-        distances=landmark_map.distances if some.start == 0 else (),
     )
 
 

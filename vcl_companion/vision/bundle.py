@@ -7,9 +7,8 @@ position and orientation of the frame; known distances fix the scale.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, repeat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,8 +83,6 @@ class NormalEquations:
         cross: (N, 6V, 3) pose-point coupling.
         seen: (N, V) bool, which view sees which point.
         cost: robust cost, px^2 (distances weighted to the same unit).
-        pose_pull: (6V, F) what errors of observations, of F causes, add to ``pose_rhs``.
-        point_pull: (N, 3, F) the same of ``point_rhs``.
     """
 
     pose_block: Array
@@ -95,13 +92,11 @@ class NormalEquations:
     cross: Array
     seen: NDArray[np.bool_]
     cost: float
-    pose_pull: Array
-    point_pull: Array
 
 
 def reprojection_residuals(views: Views) -> Array:
     """Return (N, V, 2) projected minus observed, px; NaN where unseen or behind the camera."""
-    cams = _matrices(tuple(_world_from_cam(views, i).inverse() for i in range(len(views.bodies))))
+    cams = matrices_of(tuple(_world_from_cam(views, i).inverse() for i in range(len(views.bodies))))
     points, slopes, ideal = map(writable, (views.points, views.slopes, views.ideal))
     return kernels.residuals(points, cams, slopes, ideal, _MIN_DEPTH_M)
 
@@ -168,12 +163,10 @@ class _Problem:
 
     def __init__(self, views: Views, cauchy_px: float) -> None:
         seen = np.ascontiguousarray(np.isfinite(views.ideal[:, :, 0]))
-        owner, view = np.nonzero(seen)
-        self._first = np.searchsorted(owner, np.arange(len(views.points) + 1)).astype(np.int64)
-        self._view = view.astype(np.int64)
+        self._first, self._view = observations_of(seen)
         self._slopes = np.ascontiguousarray(views.slopes[seen])
         self._ideal = np.ascontiguousarray(views.ideal[seen])
-        self._mountings = _matrices(views.mountings)
+        self._mountings = matrices_of(views.mountings)
         self._cauchy_px = cauchy_px
         self._n_held = views.n_held
 
@@ -213,13 +206,25 @@ class _Problem:
         self, views: Views
     ) -> tuple[Array, Array, Array, kernels.Ints, kernels.Ints, Array, Array]:
         """Return an estimate as the compiled loops take it."""
-        points, bodies = writable(views.points), _matrices(views.bodies)
+        points, bodies = writable(views.points), matrices_of(views.bodies)
         return (
             points, bodies, self._mountings, self._first, self._view, self._slopes, self._ideal
         )  # fmt: skip
 
 
-def _matrices(poses: tuple[Pose, ...]) -> Array:
+def observations_of(seen: NDArray[np.bool_]) -> tuple[kernels.Ints, kernels.Ints]:
+    """Return (N + 1,) where each landmark's observations begin, (M,) the view of each of these.
+
+    Args:
+        seen: (N, V) which view sees which landmark.
+    """
+    owner, view = np.nonzero(seen)
+    first = np.searchsorted(owner, np.arange(len(seen) + 1))
+    return first.astype(np.int64), view.astype(np.int64)
+
+
+def matrices_of(poses: Sequence[Pose]) -> Array:
+    """Return (V, 3, 4) poses as compiled loops take them."""
     return np.ascontiguousarray(np.stack([pose.matrix()[:3] for pose in poses]))
 
 
@@ -241,17 +246,12 @@ def residual_noise_px(residuals: Array) -> float:
     return float(max(np.sqrt(np.median(squared / expected)), 0.02))
 
 
-def normal_equations(
-    views: Views, cauchy_px: float | None, errors: Iterable[Array] = (), n_causes: int = 0
-) -> NormalEquations:
+def normal_equations(views: Views, cauchy_px: float | None) -> NormalEquations:
     """Linearise every observation and distance at the present estimate (eq. 4, many views).
 
     Args:
         views: where to linearise.
         cauchy_px: scale of the robust weight; None weighs all observations one.
-        errors: of each view (M, 2, F) by how much its M observations would be off by each of F
-            causes, px; none where nobody asks.
-        n_causes: F.
     """
     n, v = views.ideal.shape[:2]
     pose_block = np.zeros((6 * v, 6 * v))
@@ -259,9 +259,8 @@ def normal_equations(
     point_block = np.zeros((n, 3, 3))
     point_rhs = np.zeros((n, 3))
     cross = np.zeros((n, 6 * v, 3))
-    pose_pull, point_pull = np.zeros((6 * v, n_causes)), np.zeros((n, 3, n_causes))
     cost = 0.0
-    for i, off in zip(range(v), chain(errors, repeat(None)), strict=False):
+    for i in range(v):
         seen = np.flatnonzero(np.isfinite(views.ideal[:, i, 0]))
         if len(seen) == 0:
             continue
@@ -284,15 +283,19 @@ def normal_equations(
         point_block[seen] += np.swapaxes(weighted_point, 1, 2) @ j_point
         point_rhs[seen] -= np.einsum("nki,nk->ni", weighted_point, residual)
         cross[seen, block] += np.swapaxes(weighted_pose, 1, 2) @ j_point
-        if off is not None:
-            pose_pull[block] += flat @ off.reshape(-1, n_causes)
-            point_pull[seen] += np.swapaxes(weighted_point, 1, 2) @ off
     for known in views.distances:
         cost += _add_distance(views, known, pose_block, pose_rhs)
     in_view = np.ascontiguousarray(np.isfinite(views.ideal[:, :, 0]))
-    return NormalEquations(
-        pose_block, pose_rhs, point_block, point_rhs, cross, in_view, cost, pose_pull, point_pull
-    )
+    return NormalEquations(pose_block, pose_rhs, point_block, point_rhs, cross, in_view, cost)
+
+
+def distance_information(views: Views) -> Array:
+    """Return the (6V, 6V) normal matrix of the known distances alone."""
+    size = 6 * len(views.bodies)
+    normal, right = np.zeros((size, size)), np.zeros(size)
+    for known in views.distances:
+        _add_distance(views, known, normal, right)
+    return normal
 
 
 def linearized(

@@ -30,7 +30,7 @@ def _turned_back(pose: Array, x: float, y: float, z: float) -> tuple[float, floa
 
 
 @compiled
-def _linearized(
+def linearized(
     point: Array,
     body: Array,
     mounting: Array,
@@ -143,7 +143,7 @@ def point_blocks(
     for j in range(len(points)):
         for m in range(first[j], first[j + 1]):
             i = view[m]
-            _linearized(
+            linearized(
                 points[j], bodies[i], mountings[i], slopes[m], ideal[m], residual, j_pose, j_point
             )
             for r in range(3):
@@ -194,7 +194,7 @@ def reduced(
         block[:] = 0.0
         for m in range(first[j], first[j + 1]):
             i = view[m]
-            _linearized(
+            linearized(
                 points[j], bodies[i], mountings[i], slopes[m], ideal[m], residual, j_pose, j_point
             )
             squared = residual[0] ** 2 + residual[1] ** 2

@@ -13,11 +13,20 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.vision import pose_errors, pose_kernels
 from vcl_companion.vision.absolute_pose import resect
-from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust, point_information
+from vcl_companion.vision.bundle import (
+    BundleOptions,
+    Distance,
+    Views,
+    adjust,
+    matrices_of,
+    observations_of,
+    point_information,
+)
 from vcl_companion.vision.essential import sampson_px
 from vcl_companion.vision.features import Features
 from vcl_companion.vision.guided_pairs import match_epipolar
 from vcl_companion.vision.hamming import hamming_index, nearest_two
+from vcl_companion.vision.joint_kernels import joined, without_points
 from vcl_companion.vision.patches import (
     AlignRules,
     Anchors,
@@ -45,6 +54,7 @@ def warm_up() -> None:
     resect(ideal_b, points, 320.0, rng)
     eliminated(np.zeros((1, 6, 3)), np.zeros((1, 3, 3)), np.ones((1, 1), dtype=np.bool_))
     carried(np.ones((1, 3, 6), np.float32), np.eye(6), np.zeros(1, np.int64))
+    _join(points)
     descriptors = np.asarray(rng.integers(0, 255, (40, 61)), dtype=np.uint8)
     nearest_two(descriptors, hamming_index(descriptors, np.arange(40)))
     still = Features(320.0 * ideal_a, descriptors)
@@ -53,6 +63,19 @@ def warm_up() -> None:
     match_epipolar(still, still, ideal_a, ideal_b, b_from_a, (0.1, 0.3), 320.0)
     _adjust(points)
     _track(rng)
+
+
+def _join(points: Array) -> None:
+    """Eliminate points that one view has seen once."""
+    n = len(points)
+    first, view = observations_of(np.ones((n, 1), dtype=np.bool_))
+    here = matrices_of([Pose.identity()])
+    seen = points[:, :2] / points[:, 2:], np.zeros((n, 2, 1))
+    of_views, _, crosses, view_pulls, point_pulls = joined(
+        points, here, here, first, view, np.tile(np.eye(2), (n, 1, 1)), *seen
+    )
+    inverses, levers = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3, 6), np.float32)
+    without_points(first, view, crosses, inverses, point_pulls, of_views, view_pulls, levers)
 
 
 def _adjust(points: Array) -> None:
