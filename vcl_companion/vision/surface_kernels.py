@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -93,7 +95,7 @@ def _cost(
 ) -> float:
     """Return what a plane through the landmark leaves unexplained (Geman-McClure)."""
     steep = stiff * ((by_x - facing[0]) ** 2 + (by_y - facing[1]) ** 2)
-    cost = _TAIL * np.log1p(steep / _TAIL)
+    cost = _TAIL * math.log1p(steep / _TAIL)
     for q in range(len(near)):
         error = near[q, 2] - by_x * near[q, 0] - by_y * near[q, 1]
         squared = error * error / near[q, 3]
