@@ -337,7 +337,7 @@ def test_who_flies_to_positions_is_slid_there(tmp_path: Path) -> None:
         options = AutopilotOptions(resets="blend", blend_speed_m_s=1.0)
         async with flying(tmp_path, options) as up:
             assert await flown_to_a_jump(up, GUIDED) is None
-            for k in range(7, 35):
+            for k in range(7, 65):
                 assert await jumps(up, k, AWAY) is None
             poses = await up.told()
             assert len({pose[28] for pose in poses}) == 1
