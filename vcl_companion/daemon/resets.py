@@ -133,13 +133,12 @@ class Resets:
         since_s = max(at_ns - self._shifted_at_ns, 0) * 1e-9
         shift = self._shift
         before = shift @ pose
-        turn_rad = _heading(shift.rotation)
-        self._now_rad_s = _speed(self._now_rad_s, self._turn_rad_s, abs(turn_rad), since_s)
-        turn_rad = _towards_zero(turn_rad, self._now_rad_s * since_s)
+        turn_rad, self._now_rad_s = _slid(
+            _heading(shift.rotation), self._now_rad_s, self._turn_rad_s, since_s
+        )
         off = before.translation - pose.translation
         length_m = float(np.linalg.norm(off))
-        self._now_m_s = _speed(self._now_m_s, self._speed_m_s, length_m, since_s)
-        left_m = _towards_zero(length_m, self._now_m_s * since_s)
+        left_m, self._now_m_s = _slid(length_m, self._now_m_s, self._speed_m_s, since_s)
         slid = off * (left_m / length_m) if length_m > 0.0 else off
         rotation = about_down(turn_rad)
         self._shift = Pose(rotation, pose.translation + slid - rotation @ pose.translation)
@@ -202,15 +201,20 @@ def _metres(pose: Pose, other: Pose) -> float:
     return float(np.linalg.norm(pose.translation - other.translation))
 
 
-def _towards_zero(value: float, step: float) -> float:
-    return math.copysign(max(abs(value) - step, 0.0), value) if abs(value) > step else 0.0
+def _slid(left: float, speed: float, most: float, since_s: float) -> tuple[float, float]:
+    """Return what is left to go so much later, and how fast that went.
 
-
-def _speed(now: float, most: float, left: float, since_s: float) -> float:
-    """Return how fast a slide is, so long after it was as fast as ``now``, with so far to go."""
+    Args:
+        left: to go, of either sign.
+        speed: it went by until now.
+        most: it may go by.
+        since_s: how much later.
+    """
     change = most / _REACHES_SPEED_S
     half = 0.5 * change * since_s
-    return min(now + 2.0 * half, most, math.sqrt(half**2 + 2.0 * change * left) - half)
+    slowing = math.sqrt(half**2 + 2.0 * change * abs(left)) - half
+    speed = min(speed + 2.0 * half, most, slowing)
+    return math.copysign(max(abs(left) - speed * since_s, 0.0), left), speed
 
 
 def _heading(rotation: Array) -> float:

@@ -138,7 +138,8 @@ def map_uncertainty(landmark_map: LandmarkMap, calibration_px: float = 0.0) -> M
             noise = noise_px(part)[seen][:, None, None]
             errors = np.empty((len(view), 2, n_causes))
             for i, errors_px in enumerate(_common_px(part, calibration_px)):
-                errors[view == i] = errors_px / noise[view == i]
+                of_view = view == i
+                errors[of_view] = errors_px / noise[of_view]
             # Pixels in units of their own sigma, as distances are.
             normal, of_points, crosses, view_pulls, point_pulls = joined(
                 writable(part.points_world), bodies, mountings, first, view,
