@@ -164,12 +164,16 @@ def test_no_process_outlives_a_harness_that_is_killed(tmp_path: Path) -> None:
     soon(end_of(child))
 
 
-def test_a_child_is_in_a_session_of_its_own(tmp_path: Path) -> None:
-    """A Ctrl-C on the terminal goes to us, and we end the children in order."""
+def test_a_child_is_in_a_group_of_its_own_in_our_session(tmp_path: Path) -> None:
+    """A Ctrl-C on the terminal goes to us, and we end the children in order.
+
+    Of a session of its own its niceness would count among its own threads only (autogroup).
+    """
 
     async def work() -> None:
         child = await started(tmp_path, "child", LONG)
-        assert os.getsid(child.process.pid) == child.process.pid != os.getsid(0)
+        assert os.getpgid(child.process.pid) == child.process.pid != os.getpgid(0)
+        assert os.getsid(child.process.pid) == os.getsid(0)
         await end_children([child], 10.0)
 
     soon(work())
