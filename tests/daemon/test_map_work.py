@@ -12,6 +12,7 @@ import pytest
 
 from tests.daemon import demo
 from tests.daemon.waiting import run
+from vcl_companion.daemon import feature_memory
 from vcl_companion.daemon.map_offer import MapOffer
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.map_work import MapWork
@@ -169,6 +170,22 @@ def test_further_indexes_share_the_map_that_is_in_use(work: MapWork) -> None:
         np.testing.assert_array_equal(index.owner, stored.index.owner)
 
     run(check())
+
+
+def test_images_that_were_looked_at_further_are_not_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    shop, stored = workplace(), pair()
+    shop.learn(stored)
+    whole = workplace()
+    whole.learn(stored)
+    for number in range(len(stored.index.landmark_map.keyframes)):
+        shop.look_further(stored.revision, number)
+    monkeypatch.setattr(feature_memory, "detect", None)
+    made = shop.more_indexed(stored.revision).fallback
+    monkeypatch.undo()
+    expected = whole.more_indexed(stored.revision).fallback
+    assert made is not None
+    assert expected is not None
+    np.testing.assert_array_equal(made.entries.descriptors, expected.entries.descriptors)
 
 
 def test_bad_bytes_are_told_as_such(work: MapWork) -> None:

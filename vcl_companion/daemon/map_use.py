@@ -16,6 +16,7 @@ from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.daemon.usage import give_back_freed
 from vcl_companion.mapping.options import NoMap
 from vcl_companion.swarm.group import Group
+from vcl_companion.swarm.pace import look_s
 from vcl_companion.swarm.transfer import BlobKind
 from vcl_companion.wire.map_update import images_missing_in
 
@@ -117,5 +118,26 @@ class MapUse:
     async def _index_current(self) -> None:
         # Not in the loop above, which would keep a map that was left until the next is asked for.
         stored = self._maps.current
-        if stored is not None and not self._maps.is_improved:
-            self._maps.improve(stored, await self._work.more_indexed(stored))
+        if stored is None or self._maps.is_improved:
+            return
+        # Image after image: who begins a map meanwhile waits for one of them at most.
+        for number in range(len(stored.index.landmark_map.keyframes)):
+            while self._maps_go_first():
+                await asyncio.sleep(look_s(self._group.stretch))
+                if not self._maps.is_in_use(stored):
+                    return
+            await self._work.look_further(stored, number)
+            if not self._maps.is_in_use(stored):
+                return  # what was found of its images the next one's index has as well
+        self._maps.improve(stored, await self._work.more_indexed(stored))
+
+    def _maps_go_first(self) -> bool:
+        """Whether the next map, being made or about to be, wants the processor for itself.
+
+        Where somebody is lost, ourselves or who wants it, the index may be what finds them.
+        """
+        group = self._group
+        members = {group.own_id, *group.wanting_update}
+        states = [state for m in members if (state := group.state_of(m)) is not None]
+        is_coming = bool(group.wanting_update) or group.is_map_coming
+        return is_coming and all(state.localized for state in states)

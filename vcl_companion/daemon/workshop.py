@@ -250,6 +250,16 @@ class Workshop:
         encoded, self._encoded = self._encoded, None
         return encoded[1] if encoded is not None and encoded[0] == data else decode_map(data)
 
+    def look_further(self, revision: bytes, number: int) -> None:
+        """Find a keyframe's features by the other detectors, before ``more_indexed`` asks for all.
+
+        Args:
+            revision: of the map.
+            number: of the keyframe in it.
+        """
+        keyframe = self._named(revision).index.landmark_map.keyframes[number]
+        self._other_memory.of_keyframe(keyframe, self._options.detectors[1:])
+
     def more_indexed(self, revision: bytes) -> MapIndex:
         """Return a map's index with those by the other detectors to fall back on."""
         stored = self._alone(revision)
