@@ -12,6 +12,7 @@ from tests.daemon import demo
 from tests.daemon.swarm import INTER, Drone
 from tests.daemon.waiting import beside
 from vcl_companion.cameras.stream import StreamCamera
+from vcl_companion.daemon.catching_up import CatchingUp
 from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
@@ -77,18 +78,20 @@ async def flying(
         )
         stack.callback(work.end)
         health = Health(drone.autopilot_link, drone.log)
+        own_fixes = OwnFixes(
+            sensor,
+            drone.autopilot_link,
+            drone.maps,
+            drone.estimator,
+            drone.log,
+            stack.enter_context(ThreadPoolExecutor(1)),
+            options,
+        )
         companion = Companion(
             camera,
             FrameOutcomes(camera, drone.clock, health, drone.log),
-            OwnFixes(
-                sensor,
-                drone.autopilot_link,
-                drone.maps,
-                drone.estimator,
-                drone.log,
-                stack.enter_context(ThreadPoolExecutor(1)),
-                options,
-            ),
+            own_fixes,
+            CatchingUp(drone.exchange.frames, drone.maps, drone.estimator, own_fixes),
             PeerPoses(drone.exchange.inter, drone.maps, drone.estimator, drone.log),
             drone.teller,
             drone.maps,

@@ -20,6 +20,7 @@ from tests.whole_lines import json_lines
 from vcl_companion.cameras.source import Frame
 from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import ManualClock
+from vcl_companion.daemon.catching_up import CatchingUp
 from vcl_companion.daemon.commands import Commands
 from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.estimator import Estimator
@@ -235,6 +236,7 @@ class Flyer(Drone):
             )  # fmt: skip
             companion = Companion(
                 source, FrameOutcomes(source, self.clock, health, self.log), own_fixes,
+                CatchingUp(self.exchange.frames, self.maps, self.estimator, own_fixes),
                 PeerPoses(self.exchange.inter, self.maps, self.estimator, self.log), self.teller,
                 self.maps, self.estimator, self.exchange.on_frame, health, self.work,
                 frame_wait_s=0.1,

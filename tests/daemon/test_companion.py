@@ -24,6 +24,7 @@ from tests.daemon.waiting import beside, hurry, run, until
 from vcl_companion.cameras.source import Frame
 from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import ManualClock
+from vcl_companion.daemon.catching_up import CatchingUp
 from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
@@ -198,8 +199,10 @@ async def flight(
         asked: list[int] = []
         inter = target_of(peers, asked, work, clock, estimator)
         peer_poses = PeerPoses(inter, maps, estimator, log)
+        own_fixes = OwnFixes(sensor, link, maps, estimator, log, executor, OPTIONS)
+        estimator.keep_of(history.has)
         companion = Companion(
-            camera, outcomes, OwnFixes(sensor, link, maps, estimator, log, executor, OPTIONS),
+            camera, outcomes, own_fixes, CatchingUp(history, maps, estimator, own_fixes),
             peer_poses, teller, maps, estimator, history.add, health, work, frame_wait_s,
         )  # fmt: skip
         await stack.enter_async_context(beside(link.run()))

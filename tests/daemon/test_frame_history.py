@@ -72,3 +72,19 @@ def test_it_does_not_grow() -> None:
         history.add(frame(100 * k))
     oldest = [at_ms for at_ms in range(0, 100_000, 100) if nearest_ms(history, at_ms) == at_ms]
     assert 30 <= len(oldest) <= 36
+
+
+@pytest.mark.parametrize("rate_hz", [5, 30])
+def test_of_who_is_lost_five_frames_a_second_are_here_since_the_last_fix(rate_hz: int) -> None:
+    history = FrameHistory()
+    for at_ms in range(0, 12_000, 1000 // rate_hz):
+        history.add(frame(at_ms), min(at_ms, 2000) * MS)
+    kept_ms = [f.captured_at_ns // MS for f in history.after(2000 * MS)]
+    assert max(np.diff([2000, *kept_ms])) <= 200 + 1000 // rate_hz
+    assert len(kept_ms) < 75
+    assert all(history.has(at_ms * MS) for at_ms in kept_ms)
+    assert not history.has(2001 * MS)
+    # Found again it is as for any other.
+    for at_ms in range(12_000, 12_500, 1000 // rate_hz):
+        history.add(frame(at_ms), at_ms * MS)
+    assert len(history.after(0)) <= 24 + 10

@@ -221,6 +221,25 @@ def test_what_is_older_than_the_history_is_refused() -> None:
     assert isinstance(between, NotFused)
 
 
+def test_of_who_is_lost_the_states_since_the_last_fix_stay_while_their_frames_do() -> None:
+    step_ns, n_found, n_lost = FRAME_NS // 2, 10, 60
+    history = PoseHistory(1.0, OPTIONS, lost_s=4.0)
+    history.has_frame = lambda at_ns: at_ns // step_ns % 3 == 0
+    fix = fix_at(truth_at(0))
+    first = started(fix, 0, np.eye(3), OPTIONS)
+    history.append(first, fix, None)
+    for k in range(1, n_found + n_lost):
+        state = predict(first, k * step_ns, np.eye(3), OPTIONS)
+        assert state is not None
+        history.append(state, fix if k < n_found else None, None)
+        kept = [n for n in range(k + 1) if history.at(n * step_ns) is not None]
+        since = max(n_found - 1 if k >= n_found else k, k - 40)
+        assert kept == [n for n in range(k + 1) if n >= k - 10 or (n >= since and n % 3 == 0)]
+    # Found again, nothing that old is of interest.
+    history.append(newest(history), fix, None)
+    assert all(history.at(n * step_ns) is None for n in range(n_found + n_lost - 11))
+
+
 def test_without_any_state_there_is_nothing_to_fuse_with() -> None:
     history, _ = flown(np.random.default_rng(7), 2)
     history.clear()

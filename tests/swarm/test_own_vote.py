@@ -152,6 +152,15 @@ def test_a_vote_stands_until_the_new_map_has_been_seen_for_a_while() -> None:
     assert not [vote.look(SECOND, Sight(PLENTY), 3.3 + k * STEP_S) for k in range(6)][-1]
 
 
+def test_a_map_that_is_behind_when_it_comes_is_voted_on_soon() -> None:
+    vote = OwnVote(OPTIONS)
+    new = Sight(PLENTY, novelty_deg=1.1 * OPTIONS.novelty_deg)
+    for k in range(20):
+        vote.look(FIRST, Sight(PLENTY), k * STEP_S)
+    votes = [vote.look(SECOND, new, 2.0 + k * STEP_S) for k in range(4)]
+    assert votes == [False, False, True, True]
+
+
 def test_without_a_map_or_with_updates_turned_off_nobody_votes() -> None:
     assert not voted([0] * 30, b"")
     assert not voted([0] * 30, options=replace(OPTIONS, tracked=0, share=0.0))

@@ -23,6 +23,7 @@ from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import Clock, ManualClock, SystemClock
 from vcl_companion.config import Config
 from vcl_companion.daemon import notify
+from vcl_companion.daemon.catching_up import CatchingUp
 from vcl_companion.daemon.commands import Commands
 from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.estimator import Estimator
@@ -213,10 +214,12 @@ async def _run(config: Config) -> int:
         rng,
     )
     teller = Teller(autopilot, estimator, clock, log, told)
+    own_fixes = OwnFixes(sensor, autopilot, maps, estimator, log, vision, pipeline)
     companion = Companion(
         camera,
         outcomes,
-        OwnFixes(sensor, autopilot, maps, estimator, log, vision, pipeline),
+        own_fixes,
+        CatchingUp(exchange.frames, maps, estimator, own_fixes),
         PeerPoses(exchange.inter, maps, estimator, log),
         teller,
         maps,

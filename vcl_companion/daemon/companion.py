@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable
 
 from vcl_companion.cameras.source import CameraSource, Frame
+from vcl_companion.daemon.catching_up import CatchingUp
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import Basis, PoseSource
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
@@ -42,6 +43,7 @@ class Companion:
         camera: where frames come from.
         outcomes: where each is answered.
         own_fixes: what each shows by itself.
+        catching_up: follows those that were lost when a map has come.
         peer_poses: what peers say of it.
         teller: tells the autopilot poses.
         maps: the current map.
@@ -58,6 +60,7 @@ class Companion:
         camera: CameraSource,
         outcomes: FrameOutcomes,
         own_fixes: OwnFixes,
+        catching_up: CatchingUp,
         peer_poses: PeerPoses,
         teller: Teller,
         maps: MapStore,
@@ -70,6 +73,7 @@ class Companion:
         self._camera = camera
         self._outcomes = outcomes
         self._own_fixes = own_fixes
+        self._catching_up = catching_up
         self._peer_poses = peer_poses
         self._teller = teller
         self._maps = maps
@@ -102,6 +106,7 @@ class Companion:
         """Localize frames until cancelled."""
         async with asyncio.TaskGroup() as beside:
             beside.create_task(self._teller.run())
+            beside.create_task(self._catching_up.run())
             while True:
                 await self._take_next(beside)
 
@@ -135,6 +140,10 @@ class Companion:
         if isinstance(fix, Localized) or not follows:
             self._estimator.in_sight.seen_on = stored.revision
         if isinstance(fix, NotLocalized) and follows:
+            if self._catching_up.is_under_way:
+                await self._waits.unless_newer(frame, self._catching_up.ended())
+                if not (self._catching_up.is_under_way or self._mailbox.has_had_newer(frame)):
+                    return await self._localize(frame, self._maps.current or stored)
             search = self._map_search
             if search.is_under_way:
                 # What is found there leads this frame too, if it is still the newest then.

@@ -25,6 +25,8 @@ from vcl_companion.localization.proposals import NotFused, started_from_proposal
 _MAX_CONTRADICTED = 5
 # How far back a proposal may reach; a peer that takes longer speaks of another place.
 HISTORY_S = 5.0
+# How far back frames may still be found that were lost beyond what the map showed then.
+LOST_S = 12.0
 _LEAST_ARM_M = 1.0
 
 
@@ -57,7 +59,7 @@ class Estimator:
         self._options = options
         self._localization = localization
         self._jumped = jumped
-        self._history = PoseHistory(HISTORY_S, options)
+        self._history = PoseHistory(HISTORY_S, options, LOST_S)
         self._n_contradicted = 0
         self._has_begun = False
         self.n_resets = 0
@@ -113,6 +115,10 @@ class Estimator:
             return None
         pose = state.world_from_body
         return Pose(pose.rotation, pose.translation + ahead_s * state.velocity_world)
+
+    def keep_of(self, has_frame: Callable[[int], bool]) -> None:
+        """Keep what is believed of frames since the last fix while they are there themselves."""
+        self._history.has_frame = has_frame
 
     def forget(self) -> None:
         """Know nothing of where we are any more: the next frame is looked for everywhere."""

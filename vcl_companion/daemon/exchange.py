@@ -24,6 +24,7 @@ from vcl_companion.daemon.deliveries import Deliveries
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_answers import FrameAnswers
+from vcl_companion.daemon.frame_choice import FrameChoice
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.inter_host import InterHost
 from vcl_companion.daemon.inter_target import InterTarget
@@ -128,7 +129,11 @@ class Exchange:
             self._refusals.count,
             options.clock_resolution_ns,
         )
-        self._frames = FrameHistory()
+        self.frames = FrameHistory()
+        """Our own of the last seconds."""
+        self._last_own_fix = estimator.last_own_fix
+        estimator.keep_of(self.frames.has)
+        choice = FrameChoice(system_id, self.frames, maps, estimator, clock)
         self._passed = PassedFrames(
             group,
             partial(self._outbox.hand, BlobKind.PASSED_FRAME),
@@ -138,7 +143,7 @@ class Exchange:
         )
         self._answers = FrameAnswers(
             system_id,
-            self._frames,
+            choice,
             maps,
             autopilot,
             estimator,
@@ -174,7 +179,8 @@ class Exchange:
         self.results = RoundResults(group, maps, self._sharing.own_maps, self._outbox.send, log)
         self._rounds = MapRounds(
             group,
-            self._frames,
+            self.frames,
+            choice,
             maps,
             self._answers.describe,
             self._answers.detail,
@@ -208,7 +214,7 @@ class Exchange:
         )
         self._inter_host = InterHost(
             maps,
-            self._frames,
+            self.frames,
             estimator,
             self._outbox.send,
             self._refusals.count,
@@ -262,7 +268,7 @@ class Exchange:
 
     def on_frame(self, frame: Frame) -> None:
         """Keep a frame of our own for peers, and for a first map."""
-        self._frames.add(frame)
+        self.frames.add(frame, self._last_own_fix.at_ns)
 
     def on_heartbeat(self, peer: int) -> None:
         """Note a sign of life."""
@@ -282,7 +288,7 @@ class Exchange:
             parts.create_task(self._passed.run())
             parts.create_task(self._sharing.run())
             parts.create_task(self._inter_host.run())
-            parts.create_task(keep_place_known(self._group, self._frames, self._work))
+            parts.create_task(keep_place_known(self._group, self.frames, self._work))
             parts.create_task(self._keep_going())
 
     async def _keep_going(self) -> None:

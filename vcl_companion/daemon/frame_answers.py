@@ -12,7 +12,7 @@ from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
-from vcl_companion.daemon.frame_history import FrameHistory
+from vcl_companion.daemon.frame_choice import FrameChoice
 from vcl_companion.daemon.mailbox import PeerMailbox
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
@@ -64,7 +64,7 @@ class FrameAnswers:
 
     Args:
         system_id: this drone.
-        frames: our own.
+        choice: chooses which of ours a request is answered with.
         maps: what they may extend.
         autopilot: for the attitude that goes with a frame.
         estimator: for the pose that goes with it.
@@ -82,7 +82,7 @@ class FrameAnswers:
     def __init__(
         self,
         system_id: int,
-        frames: FrameHistory,
+        choice: FrameChoice,
         maps: MapStore,
         autopilot: AutopilotLink,
         estimator: Estimator,
@@ -97,7 +97,7 @@ class FrameAnswers:
         image_bytes: int,
     ) -> None:
         self._system_id = system_id
-        self._frames = frames
+        self._choice = choice
         self._maps = maps
         self._autopilot = autopilot
         self._estimator = estimator
@@ -149,7 +149,7 @@ class FrameAnswers:
         given = self._given.get(peer)
         if given is not None and given.answers(wanted):
             return given.blob
-        frame = self._frames.nearest(wanted.instant.at_ns)
+        frame = await self._choice.of(wanted.instant.at_ns)
         if frame is None:
             return None
         answer = await self.describe(frame, wanted.request_id)

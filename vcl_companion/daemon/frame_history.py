@@ -1,4 +1,4 @@
-"""The last few frames, for peers who ask for the one of a certain instant."""
+"""The last few frames, for peers who ask for the one of a certain instant, and for who is lost."""
 
 from __future__ import annotations
 
@@ -13,25 +13,36 @@ _N_FRAMES = 24
 # Who joins late is asked for frames from several places; a second apart is near enough.
 _SPARSE_SPACING_NS = 900_000_000
 _N_SPARSE = 10
+# Who is lost is followed from frame to frame when a map has come that shows them.
+_LOST_SPACING_NS = 180_000_000
+_N_LOST = 60
 # A frame from further off shows another moment of the flight: no frame is better.
 FURTHEST_NS = 1_000_000_000
 
 
 class FrameHistory:
-    """Keeps about the last two seconds, and of the ten before them one a second."""
+    """Keeps about the last two seconds, and of the ten before them one a second.
+
+    Of who is lost five a second, since the last fix.
+    """
 
     def __init__(self) -> None:
         self._kept: deque[Frame] = deque(maxlen=_N_FRAMES)
-        self._sparse: deque[Frame] = deque(maxlen=_N_SPARSE)
+        self._sparse: list[Frame] = []
         self._newest: Frame | None = None
 
-    def add(self, frame: Frame) -> None:
-        """Keep one more: always until the next one comes, longer unless frames come fast."""
+    def add(self, frame: Frame, fixed_at_ns: int | None = None) -> None:
+        """Keep one more: always until the next one comes, longer unless frames come fast.
+
+        Args:
+            frame: not before the last one.
+            fixed_at_ns: of the last frame that had a fix; None where none had.
+        """
         self._newest = frame
         if self._kept and abs(frame.captured_at_ns - self._kept[-1].captured_at_ns) < _SPACING_NS:
             return
         if len(self._kept) == _N_FRAMES:
-            self._thin_out(self._kept[0])
+            self._thin_out(self._kept[0], fixed_at_ns)
         self._kept.append(frame)
 
     @property
@@ -45,13 +56,30 @@ class FrameHistory:
 
     def near(self, at_ns: int) -> list[Frame]:
         """Return the frames captured within a second of an instant, the nearest first."""
-        frames = [*self._sparse, *self._kept, *([self._newest] if self._newest else [])]
-        near = (f for f in frames if abs(f.captured_at_ns - at_ns) <= FURTHEST_NS)
+        near = (f for f in self._all() if abs(f.captured_at_ns - at_ns) <= FURTHEST_NS)
         return sorted(near, key=lambda f: abs(f.captured_at_ns - at_ns))
 
-    def _thin_out(self, frame: Frame) -> None:
-        """Keep a frame that leaves the dense part if the last one kept so is long ago."""
-        sparse = self._sparse
-        if sparse and abs(frame.captured_at_ns - sparse[-1].captured_at_ns) < _SPARSE_SPACING_NS:
-            return
-        sparse.append(frame)
+    def after(self, at_ns: int) -> list[Frame]:
+        """Return the frames captured after an instant, in the order of their time."""
+        frames = {f.captured_at_ns: f for f in self._all() if f.captured_at_ns > at_ns}
+        return [frames[captured_at_ns] for captured_at_ns in sorted(frames)]
+
+    def _all(self) -> list[Frame]:
+        return [*self._sparse, *self._kept, *([self._newest] if self._newest else [])]
+
+    def has(self, at_ns: int) -> bool:
+        """Return whether the frame of an instant is here."""
+        return any(frame.captured_at_ns == at_ns for frame in self._all())
+
+    def _thin_out(self, leaving: Frame, fixed_at_ns: int | None) -> None:
+        """Keep of the frames that left the dense part those that are far enough apart."""
+        found: list[Frame] = []
+        lost: list[Frame] = []
+        for frame in (*self._sparse, leaving):
+            at_ns = frame.captured_at_ns
+            is_lost = fixed_at_ns is not None and at_ns >= fixed_at_ns
+            before = next(reversed(lost or found), None)
+            apart_ns = _LOST_SPACING_NS if is_lost else _SPARSE_SPACING_NS
+            if before is None or at_ns - before.captured_at_ns >= apart_ns:
+                (lost if is_lost else found).append(frame)
+        self._sparse = found[-_N_SPARSE:] + lost[-_N_LOST:]

@@ -32,6 +32,7 @@ class Wanted:
         earlier: how many more of some members.
         spacing_s: time between a member's frames.
         timeout_s: how long to wait for all of them.
+        furthest_ns: from its instant a frame may be, if it says where it was taken.
     """
 
     at_ns: int
@@ -39,6 +40,7 @@ class Wanted:
     earlier: Mapping[int, int] = field(default_factory=dict)
     spacing_s: float = 1.0
     timeout_s: float = 20.0
+    furthest_ns: int = FURTHEST_NS
 
     def instant_ns(self, n: int) -> int:
         """Return the instant of a member's n-th frame, our clock."""
@@ -129,7 +131,8 @@ class Gathering:
                     await self._news()
         came = [frame for sent in self._peers.values() for frame in sent.frames]
         self._peers = None
-        return came
+        # Who is lost may have one frame for several instants: the last that had a fix.
+        return list({(f.drone_id, f.captured_at_ns): f for f in came}.values())
 
     def _is_of_another_instant(self, peer: int, frame: FrameAnswer, n: int) -> bool:
         """Whether a frame is surely not the n-th one that was asked for.
@@ -144,7 +147,8 @@ class Gathering:
             return False
         # The peer knew our clock no better than we know its.
         off_ns = abs(taken.at_ns - self._wanted.instant_ns(n)) - 2 * taken.bound_ns
-        return off_ns > FURTHEST_NS
+        is_placed = frame.world_from_body is not None
+        return off_ns > (self._wanted.furthest_ns if is_placed else FURTHEST_NS)
 
     def _is_open(self, member: int, wanted: Wanted) -> bool:
         """Whether something of a member is still to come."""

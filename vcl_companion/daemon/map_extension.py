@@ -17,6 +17,9 @@ from vcl_companion.swarm.pace import look_s
 from vcl_companion.swarm.update_options import UpdateOptions
 from vcl_companion.wire.frame_codec import FrameAnswer
 
+# By then a new map has been seen for long enough to be voted on.
+_JUDGED_S = 0.6
+
 Decide = Callable[[LandmarkMap | NoMap, StoredMap | None, int], Awaitable[None]]
 """Takes what became of a round, the map in use when it began (None: a first one), its id."""
 
@@ -95,6 +98,10 @@ class MapExtension:
             if not left_out or current is None:
                 return is_from_new_places
             await self._delivered(current)
+            if await self._is_wanted_again(current):
+                left_out = [frame for frame in left_out if frame.drone_id in lost]
+            if not left_out:
+                return is_from_new_places
             return await self._extend_by_features(current, left_out, request_id) or (
                 is_from_new_places
             )
@@ -136,6 +143,19 @@ class MapExtension:
         while self._group.lacking() and not self.is_past(stored) and self._now_s() < until_s:
             await asyncio.sleep(look_s(self._group.stretch))
 
+    async def _is_wanted_again(self, stored: StoredMap) -> bool:
+        """Whether the majority wants a revision replaced as soon as it has seen something of it.
+
+        Then newer frames go first: features take seconds, in which who is on the move comes to
+        where the map has nothing.
+        """
+        until_s = self._now_s() + _JUDGED_S
+        while not (is_wanted := self._group.majority_wants_update) and self._now_s() < until_s:
+            if self.is_past(stored):
+                break
+            await asyncio.sleep(look_s(self._group.stretch))
+        return is_wanted
+
     def _now_s(self) -> float:
         return asyncio.get_running_loop().time()
 
@@ -154,9 +174,13 @@ def _has_new_places(built: LandmarkMap, old: LandmarkMap, novelty_deg: float) ->
 def _left_out(
     frames: list[FrameAnswer], built: LandmarkMap, stored: StoredMap, lost: tuple[int, ...]
 ) -> list[FrameAnswer]:
-    """Return the frames that did not get into a map, but may by their features."""
+    """Return the frames that did not get into a map, but may by their features.
+
+    Not those of a drone that another one of is in it: it follows the map from there.
+    """
     shown = {(k.drone_id, k.captured_at_ns) for k in built.keyframes}
-    left_out = [f for f in frames if (f.drone_id, f.captured_at_ns) not in shown]
+    joined = {f.drone_id for f in frames if (f.drone_id, f.captured_at_ns) in shown}
+    left_out = [f for f in frames if f.drone_id not in joined]
     return [f for f in left_out if f.drone_id in lost or _is_far(f, stored)]
 
 

@@ -20,6 +20,8 @@ class MapInSight:
         covered: share of the last frame that they filled; 0 when it was refused.
         novelty_deg: how differently they looked there from how they are remembered, degrees.
         seen_on: revision of the map that the last frame was looked at on.
+        beyond: revision of the map that was followed as far as it shows, the last frame being
+            beyond that.
         sought_since_s: since when a frame is looked for by its features, by the loop's time;
             None where none is, or where the map was looked through in vain before.
     """
@@ -29,6 +31,7 @@ class MapInSight:
         self.covered = 0.0
         self.novelty_deg = 0.0
         self.seen_on = b""
+        self.beyond = b""
         self.sought_since_s: float | None = None
         self._looked_at_ns = -1
         self._looked = asyncio.Event()
@@ -48,6 +51,8 @@ class MapInSight:
 
         One is looked for by its features, has been for no long time, and none after it gave a pose.
         """
+        if self.beyond and self.beyond == self.seen_on:
+            return False
         since_s = self.sought_since_s
         return since_s is not None and now_s < since_s + _SOUGHT_S and not self.tracked
 

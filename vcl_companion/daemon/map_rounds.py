@@ -19,6 +19,7 @@ from vcl_companion.cameras.source import Frame
 from vcl_companion.clock import Clock
 from vcl_companion.daemon.first_map_turn import FirstMapTurn
 from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.frame_choice import FURTHEST_BACK_NS, FrameChoice
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.gathering import Gathering, Wanted
 from vcl_companion.daemon.map_extension import Decide, MapExtension
@@ -71,6 +72,7 @@ class MapRounds:
     Args:
         group: who is there, and who wants what.
         frames: our own.
+        choice: which of them an update is made of.
         maps: where the result goes, by ``decide``.
         describe: makes the answer that a peer would give of one of our frames.
         detail: says how much of one of our frames the map is extended by.
@@ -93,6 +95,7 @@ class MapRounds:
         self,
         group: Group,
         frames: FrameHistory,
+        choice: FrameChoice,
         maps: MapStore,
         describe: Callable[[Frame, int], Awaitable[FrameAnswer]],
         detail: Callable[[Frame], Awaitable[Detail]],
@@ -111,6 +114,7 @@ class MapRounds:
     ) -> None:
         self._group = group
         self._frames = frames
+        self._choice = choice
         self._maps = maps
         self._detail = detail
         self._decide = decide
@@ -225,7 +229,8 @@ class MapRounds:
         _log.info("the map is updated, %s", reason)
 
         request_id = self._round_frames.begin()
-        contributors = await self._contributors(stored, frame, lost)
+        own = await self._choice.of(frame.captured_at_ns) or frame
+        contributors = await self._contributors(stored, own, lost)
         earlier = dict.fromkeys(lost, update.joiner_frames - 1)
         n_frames = len(contributors) - 1 + sum(earlier.values())
         wanted = Wanted(
@@ -234,10 +239,11 @@ class MapRounds:
             earlier,
             update.joiner_spacing_s,
             update.gather_timeout_s + self._carried_in_s(n_frames),
+            FURTHEST_BACK_NS,
         )
         self.progress = _GATHERING
         frames = await self._round_frames.gathered(
-            frame, wanted, lambda: self._extension.is_past(stored), passes_on=True
+            own, wanted, lambda: self._extension.is_past(stored), passes_on=True
         )
         self.progress = _BUILDING
         return await self._extension.extend(stored, frames, lost, request_id)

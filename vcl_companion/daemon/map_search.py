@@ -20,9 +20,10 @@ from vcl_companion.localization.pipeline import Effort
 
 # How often a second detector looks for a drone that is lost: it takes as long as ten frames.
 _FALL_BACK_EVERY_S = 1.0
-# A search in vain that took longer than frames are apart is not begun again before so many
-# times as long: on a small board the map that it needs would else never be made.
-_PAUSE_AFTER_VAIN = 1.0
+# A search in vain that took longer than frames are apart is not begun again before as long, and
+# twice as long after each further one of the same map, up to this: the processor is needed for
+# the map that will show where we are.
+_LONGEST_PAUSE_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +62,7 @@ class MapSearch:
         self._work = work
         # A map that may have been left since, which is not to be kept in memory for that.
         self._searched: weakref.ref[StoredMap] | None = None
+        self._pause_s = 0.0
         self._fell_back_at_s = self._again_at_s = -math.inf
         self._over = asyncio.Event()
         self._over.set()
@@ -127,6 +129,7 @@ class MapSearch:
             )
             if not self._maps.has_left_world(stored.world):
                 if isinstance(fix, Localized):
+                    self._pause_s = 0.0
                     return stored, fix
                 self._searched_in_vain(frame, stored, began_s)
                 if sought.may_fall_back and stored.index.fallback is not None:
@@ -138,10 +141,13 @@ class MapSearch:
     def _searched_in_vain(self, frame: Frame, stored: StoredMap, began_at_s: float) -> None:
         """Note a search that found nothing, and whether it took longer than frames are apart."""
         ended_at_s = asyncio.get_running_loop().time()
+        took_s = ended_at_s - began_at_s
+        twice_s = 2.0 * self._pause_s if self._was_searched(stored) else 0.0
+        self._pause_s = max(took_s, min(twice_s, _LONGEST_PAUSE_S))
         self._searched = weakref.ref(stored)
         self._maps.want_more()
         if self._mailbox.has_had_newer(frame):
-            self._again_at_s = ended_at_s + _PAUSE_AFTER_VAIN * (ended_at_s - began_at_s)
+            self._again_at_s = ended_at_s + self._pause_s
 
     def _was_searched(self, stored: StoredMap) -> bool:
         """Whether it is this map that was searched in vain last."""

@@ -100,7 +100,7 @@ class RoundFrames:
         own = [newest]
         for n in range(1, 1 + wanted.earlier.get(self._group.own_id, 0)):
             earlier = self._frames.nearest(wanted.instant_ns(n))
-            if earlier is not None:
+            if earlier is not None and earlier not in own:
                 own.append(earlier)
         try:
             return [await self._describe(f, self._gathering.request_id) for f in own]

@@ -8,6 +8,7 @@ again on top of it.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from vcl_companion.geometry.pose import Pose
@@ -36,12 +37,20 @@ class PoseHistory:
     Args:
         length_s: how far back a proposal may reach.
         options: the filter's, to apply measurements again.
+        lost_s: how far back, if that is longer, the states since the last fix are kept of
+            frames that ``has_frame``: a map that comes later may show where they were.
+
+    Attributes:
+        has_frame: whether the frame of an instant is still there. A state is a tenth of a
+            megabyte with a large map, so only of these.
     """
 
-    def __init__(self, length_s: float, options: FilterOptions) -> None:
+    def __init__(self, length_s: float, options: FilterOptions, lost_s: float = 0.0) -> None:
         if not length_s > 0:
             raise ValueError(f"length_s must be positive, got {length_s}")
         self._length_ns = round(length_s * 1e9)
+        self._lost_ns = round(lost_s * 1e9)
+        self.has_frame: Callable[[int], bool] = lambda at_ns: False
         self._options = options
         self._steps: deque[_Step] = deque()
 
@@ -91,8 +100,7 @@ class PoseHistory:
         if self._steps and state.at_ns == self._steps[-1].state.at_ns:
             self._steps.pop()
         self._steps.append(_Step(state, fix, ned_from_body))
-        while self._steps[0].state.at_ns < state.at_ns - self._length_ns:
-            self._steps.popleft()
+        self._forget_before(state.at_ns)
 
     def fuse(
         self, at_ns: int, world_from_body: Pose, covariance: Array, arm_m: float
@@ -111,9 +119,9 @@ class PoseHistory:
         if not self._steps:
             return NotFused("there is no state to fuse with")
         k = self._nearest(at_ns)
-        if k is None:
-            age_s = (self._steps[-1].state.at_ns - at_ns) * 1e-9
-            return NotFused(f"no frame of {age_s:.1f} s ago is remembered")
+        age_ns = self._steps[-1].state.at_ns - at_ns
+        if k is None or age_ns > self._length_ns:
+            return NotFused(f"no frame of {age_ns * 1e-9:.1f} s ago is remembered")
         fused = fuse(self._steps[k].state, world_from_body, covariance, arm_m)
         if isinstance(fused, NotFused):
             return fused
@@ -156,6 +164,18 @@ class PoseHistory:
         for n, step in enumerate(replayed):
             self._steps[k + n] = step
         return True
+
+    def _forget_before(self, now_ns: int) -> None:
+        """Let go of what is too old, but for what of it may still be found."""
+        steps = self._steps
+        fixed_at_ns = next((s.state.at_ns for s in reversed(steps) if s.fix is not None), -1)
+        old: list[_Step] = []
+        while steps[0].state.at_ns < now_ns - self._length_ns:
+            old.append(steps.popleft())
+        for step in reversed(old):
+            at_ns = step.state.at_ns
+            if at_ns >= max(fixed_at_ns, now_ns - self._lost_ns) and self.has_frame(at_ns):
+                steps.appendleft(step)
 
     def _nearest(self, at_ns: int) -> int | None:
         """Return the place of the step of an instant, None when there is none."""

@@ -40,7 +40,7 @@ _LOOKS_APART_S = 0.04
 # majority hardly meet.
 _STANDS_S = 0.5
 # A new map is not judged by less than this share of the window.
-_JUDGED_SHARE = 0.5
+_JUDGED_SHARE = 0.2
 # A flight comes step by step to where a view will be so many times as new as one that is here
 # already: of photographs metres apart the next one may be lost.
 _NEWER_AHEAD = 1.6

@@ -1,0 +1,111 @@
+"""Who is lost beyond what the map shows: what the next map is made of, and what that finds."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.daemon import demo
+from tests.daemon.test_companion import DRONE, Flight, flying
+from tests.daemon.waiting import run, until
+from vcl_companion.daemon.frame_choice import FrameChoice
+
+FOUND, LOST = (0, 1), (2, 3, 4)
+
+
+def at_ns(k: int) -> int:
+    return demo.shot(DRONE, k).at_ns
+
+
+@asynccontextmanager
+async def lost(path: Path) -> AsyncIterator[Flight]:
+    """A drone that was localized at ``FOUND`` and not at ``LOST``, on a map that shows nothing."""
+    async with flying(path) as up:
+        for frames, fly, outcome in (
+            (FOUND, up.fly_on_a_map, "localized"),
+            (LOST, up.fly_on_nothing_known, "refused"),
+        ):
+            fly()
+            for k in frames:
+                up.give(k)
+                await up.server.answered()
+                assert up.server.outcomes[k] == outcome
+        yield up
+
+
+def chosen(up: Flight) -> FrameChoice:
+    return FrameChoice(DRONE, up.history, up.maps, up.estimator, up.clock)
+
+
+def test_what_was_lost_is_followed_on_the_next_map_up_to_the_newest(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with lost(tmp_path) as up:
+            n_told = up.autopilot.poses.qsize()
+            up.fly_on_a_map()
+            await until(lambda: up.estimator.own_fix_at(at_ns(LOST[-1])) is not None)
+            for k in LOST:
+                state = up.estimator.own_fix_at(at_ns(k))
+                assert state is not None
+                off = demo.world_from_body(DRONE, k).local(state.world_from_body)
+                assert np.linalg.norm(off[:3]) < 0.05
+            # Nobody is told where it was.
+            assert up.autopilot.poses.qsize() == n_told
+            assert [outcome for _, outcome, _ in up.frames()] == (
+                ["localized"] * len(FOUND) + ["refused"] * len(LOST)
+            )
+
+    run(scenario())
+
+
+def test_a_map_is_extended_by_the_last_frame_that_was_found(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with lost(tmp_path) as up:
+            frame = await chosen(up).of(at_ns(LOST[-1]))
+            assert frame is not None
+            assert frame.captured_at_ns == at_ns(FOUND[-1])
+            up.fly_on_a_map()
+            await until(lambda: up.estimator.own_fix_at(at_ns(LOST[-1])) is not None)
+            for k in (*FOUND, *LOST):
+                frame = await chosen(up).of(at_ns(k))
+                assert frame is not None
+                assert frame.captured_at_ns == at_ns(k)
+
+    run(scenario())
+
+
+def test_a_frame_that_the_map_has_already_is_not_given_again(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            up.give(0)
+            await up.server.answered()
+            up.fly_on_nothing_known()
+            assert up.maps.current is not None
+            known = up.maps.current.index.landmark_map.keyframes
+            assert (DRONE, at_ns(0)) in [(k.drone_id, k.captured_at_ns) for k in known]
+            up.give(1)
+            await up.server.answered()
+            frame = await chosen(up).of(at_ns(1))
+            assert frame is not None
+            assert frame.captured_at_ns == at_ns(1)
+
+    run(scenario())
+
+
+@pytest.mark.parametrize("k", [0, 1])
+def test_without_a_map_it_is_the_frame_of_the_instant(tmp_path: Path, k: int) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            assert await chosen(up).of(at_ns(k)) is None
+            for given in (0, 1):
+                up.give(given)
+            await until(lambda: up.history.newest is not None and len(up.history.after(0)) == 2)
+            frame = await chosen(up).of(at_ns(k))
+            assert frame is not None
+            assert frame.captured_at_ns == at_ns(k)
+
+    run(scenario())

@@ -1,0 +1,97 @@
+"""The frames of a round: of which instant they may be, and that each counts once."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.daemon import demo
+from tests.daemon.waiting import beside, passes, run, until
+from vcl_companion.clock import ManualClock
+from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.frame_choice import FURTHEST_BACK_NS
+from vcl_companion.daemon.gathering import Gathering, Wanted
+from vcl_companion.daemon.peer_clocks import PeerClocks
+from vcl_companion.swarm.group import Group, SwarmOptions
+from vcl_companion.wire.frame_codec import FrameAnswer
+from vcl_companion.wire.messages import FrameRequest
+
+SECOND = 1_000_000_000
+NOW_NS = 50 * SECOND
+ELSEWHEN = "frame of another instant than the one asked for"
+
+
+def answer(request_id: int, ago_s: float, *, is_placed: bool) -> FrameAnswer:
+    """Drone 2's frame of so long ago."""
+    where = demo.world_from_body(2, 0) if is_placed else None
+    return replace(
+        demo.answer(2, 0, request_id),
+        captured_at_ns=NOW_NS - round(ago_s * SECOND),
+        frame_age_s=ago_s,
+        world_from_body=where,
+    )
+
+
+async def gathered(
+    wanted: Wanted, answers: list[tuple[float, bool]]
+) -> tuple[list[FrameAnswer], list[str | None]]:
+    """Drone 1's round, in which drone 2, whose clock is known, answers so; and what is refused."""
+    clock = ManualClock(NOW_NS)
+    group = Group(SwarmOptions((1, 2)), 1)
+    times: list[int] = []
+    clocks = PeerClocks(
+        group, lambda ts1, _: times.append(ts1), clock, FlightLog("", clock), lambda *_: None, 0
+    )
+    for _ in group.heartbeat(2, asyncio.get_running_loop().time()):
+        clocks.joined(2)
+    async with beside(clocks.run()):
+        await until(lambda: bool(times))
+    clocks.answered(2, times[0], times[0])
+    asked: list[FrameRequest] = []
+    gathering = Gathering(
+        group, lambda request, _: asked.append(request), clock, clocks, np.random.default_rng(0)
+    )
+    gathering.begin()
+    frames: list[FrameAnswer] = []
+    refused: list[str | None] = []
+
+    async def gather() -> None:
+        frames.extend(await gathering.gather(wanted, lambda: False))
+
+    async with asyncio.TaskGroup() as round_:
+        round_.create_task(gather())
+        await until(lambda: bool(asked))
+        for ago_s, is_placed in answers:
+            frame = answer(asked[-1].request_id, ago_s, is_placed=is_placed)
+            refused.append(gathering.take(2, frame))
+            await passes(0.25)
+    return frames, refused
+
+
+@pytest.mark.parametrize("is_update", [True, False])
+def test_who_says_where_it_was_may_show_an_earlier_instant_in_an_update(is_update: bool) -> None:
+    async def scenario() -> None:
+        wanted = Wanted(NOW_NS, (2,), timeout_s=5.0)
+        if is_update:
+            wanted = replace(wanted, furthest_ns=FURTHEST_BACK_NS)
+        given = [(20.0, True), (5.0, False), (5.0, True), (0.2, False)]
+        frames, refused = await gathered(wanted, given[:3] if is_update else given)
+        assert refused == [ELSEWHEN, ELSEWHEN, None] if is_update else [ELSEWHEN] * 3 + [None]
+        assert [f.captured_at_ns for f in frames] == [NOW_NS - (5 if is_update else 0.2) * SECOND]
+
+    run(scenario())
+
+
+def test_a_frame_that_answers_for_several_instants_counts_once() -> None:
+    async def scenario() -> None:
+        wanted = Wanted(
+            NOW_NS, (2,), {2: 2}, spacing_s=1.5, timeout_s=5.0, furthest_ns=FURTHEST_BACK_NS
+        )
+        frames, refused = await gathered(wanted, [(3.0, True)] * 3)
+        assert refused == [None] * 3
+        assert [f.captured_at_ns for f in frames] == [NOW_NS - 3 * SECOND]
+
+    run(scenario())

@@ -1,0 +1,81 @@
+"""Which of our frames a map is extended by: that of an instant, or the last one that shows it.
+
+Who turns away faster than maps are made is lost beyond what the map shows. A frame from there
+joins nothing; the last one that was followed joins at once, and what is made of it reaches
+further (``CatchingUp``).
+"""
+
+from __future__ import annotations
+
+from vcl_companion.cameras.source import Frame
+from vcl_companion.clock import Clock
+from vcl_companion.daemon.estimator import LOST_S, Estimator
+from vcl_companion.daemon.frame_history import FrameHistory
+from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.mapping.landmark_map import LandmarkMap
+
+FURTHEST_BACK_NS = round(LOST_S * 1e9)
+"""How much older than asked for a frame may be that says where it was taken."""
+
+# The frame may be being looked at right now.
+_SETTLE_S = 0.5
+# What was taken so soon after a keyframe shows no more than that.
+_LATER_NS = 50_000_000
+
+
+class FrameChoice:
+    """Chooses frames of ours.
+
+    Args:
+        system_id: this drone.
+        frames: our own.
+        maps: what they extend.
+        estimator: which of them had a fix.
+        clock: time base of frames.
+    """
+
+    def __init__(
+        self,
+        system_id: int,
+        frames: FrameHistory,
+        maps: MapStore,
+        estimator: Estimator,
+        clock: Clock,
+    ) -> None:
+        self._system_id = system_id
+        self._frames = frames
+        self._maps = maps
+        self._estimator = estimator
+        self._clock = clock
+
+    async def of(self, at_ns: int) -> Frame | None:
+        """Return the frame nearest to an instant, or the last one before it that had a fix.
+
+        That only if the nearest had none, and if it shows more than our keyframes in the map do:
+        where nobody moves on, it is the nearest that the map lacks.
+
+        Args:
+            at_ns: the instant, our clock.
+
+        Returns:
+            None where there is no frame within a second of it.
+        """
+        nearest = self._frames.nearest(at_ns)
+        if nearest is None or self._maps.current is None:
+            return nearest
+        until_ns = nearest.captured_at_ns
+        if self._estimator.is_localized(self._clock.now_ns()):
+            await self._estimator.in_sight.looked_at(until_ns, _SETTLE_S)
+        stored = self._maps.current
+        since_ns = max(until_ns - FURTHEST_BACK_NS, self._shown_until_ns(stored.index.landmark_map))
+        for frame in reversed(self._frames.after(since_ns)):
+            if frame.captured_at_ns > until_ns:
+                continue
+            if self._estimator.own_fix_at(frame.captured_at_ns) is not None:
+                return frame
+        return nearest
+
+    def _shown_until_ns(self, landmark_map: LandmarkMap) -> int:
+        """Return when our newest keyframe of a map was taken, and a moment; -1 without one."""
+        ours = [k.captured_at_ns for k in landmark_map.keyframes if k.drone_id == self._system_id]
+        return max(ours) + _LATER_NS if ours else -1
