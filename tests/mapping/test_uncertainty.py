@@ -23,8 +23,6 @@ from vcl_companion.mapping.misplacement import (
     LEAST_NOISE_PX,
     N_FIELDS,
     SMOOTH_PX,
-    noise_px,
-    smooth_px,
 )
 from vcl_companion.mapping.tracks import ideal_of_pixels
 from vcl_companion.mapping.uncertainty import map_uncertainty, views_of
@@ -68,8 +66,14 @@ def normal_matrix(landmark_map: LandmarkMap) -> tuple[Array, Array]:
 def fields_of(landmark_map: LandmarkMap) -> Array:
     """Return (N, V, 2, F) what observations err by in common, NaN where there is none."""
     out = np.full((*landmark_map.observed_px.shape, N_FIELDS), np.nan)
-    for i, field in enumerate(smooth_px(landmark_map)):
-        out[landmark_map.seen[:, i], i] = field
+    out[landmark_map.seen] = misplacement.misplacement(landmark_map)[1]
+    return out
+
+
+def noise_of(landmark_map: LandmarkMap) -> Array:
+    """Return (N, V) what each observation errs by for itself, NaN where there is none."""
+    out = np.full(landmark_map.seen.shape, np.nan)
+    out[landmark_map.seen] = misplacement.misplacement(landmark_map)[0]
     return out
 
 
@@ -91,7 +95,7 @@ def test_the_factored_covariance_is_the_dense_one(n_views: int, n_landmarks: int
     landmark_map = map_of(scene)
     uncertainty = map_uncertainty(landmark_map)
     whole, noise = normal_matrix(landmark_map)
-    np.testing.assert_allclose(noise_px(landmark_map)[landmark_map.seen], noise[landmark_map.seen])
+    np.testing.assert_allclose(noise_of(landmark_map)[landmark_map.seen], noise[landmark_map.seen])
     dense = np.asarray(np.linalg.inv(whole))
     n = 6 * (n_views - 1)
     scale = np.sqrt(np.diag(dense))
@@ -153,7 +157,7 @@ def test_keyframes_err_as_much_as_stated_where_observations_err_alike(
     fields = fields_of(truth)
     for _ in range(60):
         alike = fields @ rng.standard_normal(N_FIELDS)
-        own = noise_px(truth)[..., None] * rng.standard_normal(truth.observed_px.shape)
+        own = noise_of(truth)[..., None] * rng.standard_normal(truth.observed_px.shape)
         found = adjusted(replace(truth, observed_px=truth.observed_px + alike + own))
         errors.append(
             np.concatenate(
@@ -178,13 +182,12 @@ def test_keyframes_err_as_much_as_stated_where_lenses_are_off() -> None:
     truth = replace(made, keyframes=keyframes)
     assert n_lens_causes(truth) == 14
     by_lenses = np.full((*truth.observed_px.shape, 14), np.nan)
-    for i, field in enumerate(lenses_px(truth, 0.3)):
-        by_lenses[truth.seen[:, i], i] = field
+    by_lenses[truth.seen] = lenses_px(truth, 0.3)
     fields = fields_of(truth)
     errors, sigmas = [], []
     for _ in range(60):
         alike = fields @ rng.standard_normal(N_FIELDS) + by_lenses @ rng.standard_normal(14)
-        own = noise_px(truth)[..., None] * rng.standard_normal(truth.observed_px.shape)
+        own = noise_of(truth)[..., None] * rng.standard_normal(truth.observed_px.shape)
         found = adjusted(replace(truth, observed_px=truth.observed_px + alike + own))
         moved = [
             t.world_from_body.local(k.world_from_body)
@@ -207,9 +210,9 @@ def test_a_camera_that_stays_where_it_is_errs_in_nothing_more() -> None:
     same = tuple(
         replace(k, body_from_cam=Pose(first.body_from_cam.rotation, np.zeros(3))) for k in turned
     )
-    for i, field in enumerate(smooth_px(replace(still, keyframes=same))):
-        assert len(field) == still.seen[:, i].sum()
-        np.testing.assert_allclose(field, 0.0, atol=1e-12)
+    fields = misplacement.misplacement(replace(still, keyframes=same))[1]
+    assert len(fields) == still.seen.sum()
+    np.testing.assert_allclose(fields, 0.0, atol=1e-12)
     moving = fields_of(still)[still.seen]
     assert 0.0 < np.abs(moving).max() < SMOOTH_PX
 
@@ -236,7 +239,7 @@ def adjusted(noisy: LandmarkMap) -> LandmarkMap:
     # distance weighs in units of its sigma, the pixels in units of theirs.
     weighted = replace(
         views,
-        slopes=views.slopes / noise_px(noisy)[..., None, None],
+        slopes=views.slopes / noise_of(noisy)[..., None, None],
         distances=(Distance(0, 1, known.distance_m, known.sigma_m),),
     )
     moved, _ = adjust(weighted, BundleOptions(cauchy_px=100.0))
@@ -322,7 +325,7 @@ def test_a_map_is_never_taken_for_surer_than_patches_are() -> None:
     claims = [replace(good, pixel_noise_px=claimed_px) for claimed_px in (1e-12, 1e-300)]
     floor, silent = (map_uncertainty(m).keyframe_covariance[6:, 6:] for m in claims)
     np.testing.assert_allclose(silent, floor, rtol=1e-9)
-    assert noise_px(claims[1])[good.seen].min() >= LEAST_NOISE_PX
+    assert noise_of(claims[1])[good.seen].min() >= LEAST_NOISE_PX
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.distortion_model)

@@ -60,6 +60,7 @@ from vcl_companion.links.peers import PeerLink, open_signing
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.transfer import Transfers
+from vcl_companion.vision.compiled import pack_kernels
 from vcl_companion.wire.warm_up import warm_up
 
 _log = logging.getLogger(__name__)
@@ -151,6 +152,7 @@ async def _run(config: Config) -> int:
         await warm
     # What is there now stays for good: no later collection looks at it again, which took
     # a tenth of a second and the interpreter's lock.
+    pack_kernels()
     gc.collect()
     gc.freeze()
     began_mb = peak_resident_mb()

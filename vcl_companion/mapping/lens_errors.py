@@ -6,13 +6,14 @@ is off goes into distances, a principal point into rotations. So it is told, not
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.vision.bundle import observations_of
 
 # Two focal lengths, the principal point, a radial and two decentring coefficients (Brown 1966).
 N_LENS = 7
@@ -43,16 +44,21 @@ def n_lens_causes(landmark_map: LandmarkMap) -> int:
     return N_LENS * len(_drones(landmark_map))
 
 
-def lenses_px(landmark_map: LandmarkMap, calibration_px: float) -> Iterator[Array]:
-    """Yield of each view (M, 2, F) what all lenses' errors do to what it sees; see ``lens_px``."""
-    drones = _drones(landmark_map)
+def lenses_px(landmark_map: LandmarkMap, calibration_px: float) -> Array:
+    """Return (M, 2, F) what all lenses' errors do to what is seen; see ``lens_px``.
+
+    In the order of ``misplacement``.
+    """
+    drones, seen = _drones(landmark_map), landmark_map.seen
+    _, view = observations_of(seen)
+    pixels = landmark_map.observed_px[seen]
+    out = np.zeros((len(view), 2, N_LENS * len(drones)))
     for i, keyframe in enumerate(landmark_map.keyframes):
-        rows = np.flatnonzero(landmark_map.seen[:, i])
-        out = np.zeros((len(rows), 2, N_LENS * len(drones)))
+        rows = view == i
         first = N_LENS * drones.index(keyframe.drone_id)
-        pixels = landmark_map.observed_px[rows, i]
-        out[:, :, first : first + N_LENS] = lens_px(keyframe.camera, pixels, calibration_px)
-        yield out
+        of_view = lens_px(keyframe.camera, pixels[rows], calibration_px)
+        out[rows, :, first : first + N_LENS] = of_view
+    return out
 
 
 def _drones(landmark_map: LandmarkMap) -> Sequence[int]:

@@ -22,7 +22,7 @@ from vcl_companion.geometry.pose import adjoint
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.lens_errors import lenses_px, n_lens_causes
-from vcl_companion.mapping.misplacement import N_FIELDS, noise_px, smooth_px
+from vcl_companion.mapping.misplacement import N_FIELDS, misplacement
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.vision.bundle import (
     Distance,
@@ -44,7 +44,7 @@ _WIDER = 3.5
 _FINEST_M = 1e-6
 # So many landmarks are dealt with at a time: on its way what is known of one takes several times
 # the memory that it takes in the end.
-_AT_A_TIME = 256
+_AT_A_TIME = 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,15 +135,15 @@ def map_uncertainty(landmark_map: LandmarkMap, calibration_px: float = 0.0) -> M
             part = _of(landmark_map, some)
             seen, views = part.seen, views_of(part)
             first, view = observations_of(seen)
-            noise = noise_px(part)[seen][:, None, None]
-            errors = np.empty((len(view), 2, n_causes))
-            for i, errors_px in enumerate(_common_px(part, calibration_px)):
-                of_view = view == i
-                errors[of_view] = errors_px / noise[of_view]
+            noise_px, errors_px = misplacement(part)
+            if calibration_px:
+                by_lenses = lenses_px(part, calibration_px)
+                errors_px = np.concatenate([errors_px, by_lenses], axis=2)
+            noise = noise_px[:, None, None]
             # Pixels in units of their own sigma, as distances are.
             normal, of_points, crosses, view_pulls, point_pulls = joined(
                 writable(part.points_world), bodies, mountings, first, view,
-                views.slopes[seen] / noise, views.ideal[seen], errors,
+                views.slopes[seen] / noise, views.ideal[seen], errors_px / noise,
             )  # fmt: skip
             inverse[some] = _inverse(of_points)
             without_points(
@@ -165,16 +165,6 @@ def map_uncertainty(landmark_map: LandmarkMap, calibration_px: float = 0.0) -> M
     if not np.all(np.isfinite(covariance)):
         raise ValueError("the map's observations do not fix it")
     return MapUncertainty(covariance, inverse, lever, calibration_px)
-
-
-def _common_px(landmark_map: LandmarkMap, calibration_px: float) -> Iterator[Array]:
-    """Yield of each view by how much it errs in common, by its patches and by its lens."""
-    if not calibration_px:
-        yield from smooth_px(landmark_map)
-        return
-    both = zip(smooth_px(landmark_map), lenses_px(landmark_map, calibration_px), strict=True)
-    for of_patches, of_lenses in both:
-        yield np.concatenate([of_patches, of_lenses], axis=2)
 
 
 def _of(landmark_map: LandmarkMap, some: slice) -> LandmarkMap:

@@ -15,6 +15,39 @@ from vcl_companion.vision.compiled import compiled
 
 
 @compiled
+def seen_aside(points: Array, centres: Array, first: Ints, view: Ints) -> tuple[Array, Array]:
+    """Return how differently each observation sees its landmark than all of them on average do.
+
+    Args:
+        points: (N, 3).
+        centres: (V, 3) where the cameras were.
+        first: (N + 1,).
+        view: (M,).
+
+    Returns:
+        (M,) angle between the line of sight and the mean of the landmark's, rad; (M, 3) how far the
+        camera is from the mean of those that see the landmark, by their mean distance from it.
+    """
+    angles, moved = np.empty(len(view)), np.empty((len(view), 3))
+    for j in range(len(points)):
+        mean, middle, distance = np.zeros(3), np.zeros(3), 0.0
+        n = first[j + 1] - first[j]
+        for m in range(first[j], first[j + 1]):
+            sight = points[j] - centres[view[m]]
+            away = np.sqrt(sight @ sight)
+            mean += sight / away
+            middle += centres[view[m]] / n
+            distance += away / n
+        mean /= np.sqrt(mean @ mean)
+        for m in range(first[j], first[j + 1]):
+            sight = points[j] - centres[view[m]]
+            cosine = sight @ mean / np.sqrt(sight @ sight)
+            angles[m] = np.arccos(min(max(cosine, -1.0), 1.0))
+            moved[m] = (centres[view[m]] - middle) / distance
+    return angles, moved
+
+
+@compiled
 def joined(
     points: Array,
     bodies: Array,

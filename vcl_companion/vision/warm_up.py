@@ -26,7 +26,7 @@ from vcl_companion.vision.essential import sampson_px
 from vcl_companion.vision.features import Features
 from vcl_companion.vision.guided_pairs import match_epipolar
 from vcl_companion.vision.hamming import hamming_index, nearest_two
-from vcl_companion.vision.joint_kernels import joined, without_points
+from vcl_companion.vision.joint_kernels import joined, seen_aside, without_points
 from vcl_companion.vision.patches import (
     AlignRules,
     Anchors,
@@ -71,6 +71,7 @@ def _join(points: Array) -> None:
     first, view = observations_of(np.ones((n, 1), dtype=np.bool_))
     here = matrices_of([Pose.identity()])
     seen = points[:, :2] / points[:, 2:], np.zeros((n, 2, 1))
+    seen_aside(points, np.zeros((1, 3)), first, view)
     of_views, _, crosses, view_pulls, point_pulls = joined(
         points, here, here, first, view, np.tile(np.eye(2), (n, 1, 1)), *seen
     )
