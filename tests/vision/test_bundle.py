@@ -15,7 +15,7 @@ from vcl_companion.vision.bundle import (
     adjust,
     linearized,
     normal_equations,
-    point_information,
+    relative_sigmas,
     reprojection_residuals,
     residual_noise_px,
 )
@@ -201,11 +201,31 @@ def test_held_views_stay_and_the_others_find_their_place(n_held: int) -> None:
             assert adjusted.bodies[i] is bodies[i]
         assert_pose_close(adjusted.bodies[i], truth.bodies[i], within_m=1e-5, within_rad=1e-6)
     np.testing.assert_allclose(adjusted.points, truth.points, atol=1e-4)
-    np.testing.assert_allclose(
-        np.linalg.inv(point_information(truth)),
-        np.linalg.inv(normal_equations(truth, None).point_block),
-        rtol=1e-6,
+
+
+def test_depths_are_as_sure_as_the_normal_equations_say() -> None:
+    rng = np.random.default_rng(13)
+    truth = truth_of(facade_scene(rng, 80, 4.0, n_views=4))
+    ideal = truth.ideal.copy()
+    ideal[rng.uniform(size=ideal.shape[:2]) < 0.3] = np.nan
+    ideal[0] = np.nan  # seen by nobody
+    ideal[1, 1:] = np.nan  # by one: known but for its depth
+    truth = replace(truth, ideal=ideal)
+    information = normal_equations(truth, None).point_block
+    centres = np.stack(
+        [(b @ m).translation for b, m in zip(truth.bodies, truth.mountings, strict=True)]
     )
+    away = np.linalg.norm(truth.points[:, None] - centres, axis=2)
+    nearest = np.where(np.isfinite(ideal[..., 0]), away, np.inf).min(axis=1)
+    sigmas, n_seen = relative_sigmas(truth), np.isfinite(ideal[..., 0]).sum(axis=1)
+    several = n_seen > 1
+    assert 50 < several.sum() < 79
+    least = np.linalg.eigvalsh(information[several])[:, 0]
+    np.testing.assert_allclose(
+        sigmas[several], 1.0 / (np.sqrt(least) * nearest[several]), rtol=1e-6
+    )
+    assert (sigmas[n_seen == 0] == np.inf).all()
+    assert sigmas[n_seen == 1].min() > 100.0
 
 
 def test_a_view_that_sees_nothing_stays_and_the_others_are_adjusted() -> None:

@@ -11,7 +11,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.leverage import leverages
 from vcl_companion.mapping.options import MapOptions
-from vcl_companion.vision.bundle import Views, point_information, reprojection_residuals
+from vcl_companion.vision.bundle import Views, relative_sigmas, reprojection_residuals
 from vcl_companion.vision.hartley_sturm import triangulate_optimal
 from vcl_companion.vision.triangulation import ray_angles, triangulate
 
@@ -78,20 +78,7 @@ def depth_errors(views: Views) -> Array:
     Args:
         views: an estimate; the distance is that to the nearest view that sees the landmark.
     """
-    # The least known direction has the smallest eigenvalue.
-    least = np.linalg.eigvalsh(point_information(views) + 1e-12 * np.eye(3))[:, 0]
-    sigma = _NOISE_PX / np.sqrt(np.maximum(least, 1e-12))
-    return np.asarray(sigma / nearest_m(views))
-
-
-def nearest_m(views: Views) -> Array:
-    """Return (N,) the distance of each landmark to the nearest view that sees it."""
-    nearest = np.full(len(views.points), np.inf)
-    for i, (body, mounting) in enumerate(zip(views.bodies, views.mountings, strict=True)):
-        distance = np.linalg.norm(views.points - (body @ mounting).translation, axis=1)
-        seen = np.isfinite(views.ideal[:, i, 0])
-        nearest = np.where(seen, np.minimum(nearest, distance), nearest)
-    return nearest
+    return np.asarray(_NOISE_PX * relative_sigmas(views))
 
 
 def decisive(views: Views) -> Mask:

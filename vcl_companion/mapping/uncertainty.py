@@ -44,7 +44,7 @@ _WIDER = 3.5
 _FINEST_M = 1e-6
 # So many landmarks are dealt with at a time: on its way what is known of one takes several times
 # the memory that it takes in the end.
-_AT_A_TIME = 1024
+_AT_A_TIME = 192
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,10 +140,11 @@ def map_uncertainty(landmark_map: LandmarkMap, calibration_px: float = 0.0) -> M
                 by_lenses = lenses_px(part, calibration_px)
                 errors_px = np.concatenate([errors_px, by_lenses], axis=2)
             noise = noise_px[:, None, None]
+            errors_px /= noise
             # Pixels in units of their own sigma, as distances are.
             normal, of_points, crosses, view_pulls, point_pulls = joined(
                 writable(part.points_world), bodies, mountings, first, view,
-                views.slopes[seen] / noise, views.ideal[seen], errors_px / noise,
+                views.slopes[seen] / noise, views.ideal[seen], errors_px,
             )  # fmt: skip
             inverse[some] = _inverse(of_points)
             without_points(

@@ -141,9 +141,13 @@ def adjust(
     return views, residual_noise_px(reprojection_residuals(views))
 
 
-def point_information(views: Views) -> Array:
-    """Return (N, 3, 3) information on each landmark were the poses exact, for 1 px of noise."""
-    return kernels.point_blocks(*_Problem(views, 1.0).arguments(views))
+def relative_sigmas(views: Views) -> Array:
+    """Return (N,) 1-sigma error of each landmark, for 1 px of noise, were the poses exact.
+
+    In its least known direction, over its distance to the nearest view that sees it; infinite
+    where none does.
+    """
+    return kernels.relative_sigmas(*_Problem(views, 1.0).arguments(views))
 
 
 @dataclass(frozen=True, eq=False)

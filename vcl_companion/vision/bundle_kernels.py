@@ -16,6 +16,8 @@ Ints = NDArray[np.int64]
 
 _MIN_DEPTH_M = 1e-3
 _BEHIND_PX = 1e3
+# 1/m^2; of what is known no better nothing is.
+_LEAST_INFORMATION = 1e-12
 
 
 @compiled
@@ -128,7 +130,7 @@ def cost_of(
 
 
 @compiled
-def point_blocks(
+def relative_sigmas(
     points: Array,
     bodies: Array,
     mountings: Array,
@@ -137,10 +139,12 @@ def point_blocks(
     slopes: Array,
     ideal: Array,
 ) -> Array:
-    """Return (N, 3, 3) normal matrices of the landmarks, 1/m^2 per px^2, the poses being exact."""
+    """Return (N,) what ``bundle.relative_sigmas`` does."""
     residual, j_pose, j_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
-    blocks = np.zeros((len(points), 3, 3))
+    block, out = np.empty((3, 3)), np.full(len(points), np.inf)
     for j in range(len(points)):
+        block[:] = 0.0
+        nearest = np.inf
         for m in range(first[j], first[j + 1]):
             i = view[m]
             linearized(
@@ -148,8 +152,31 @@ def point_blocks(
             )
             for r in range(3):
                 for c in range(3):
-                    blocks[j, r, c] += j_point[0, r] * j_point[0, c] + j_point[1, r] * j_point[1, c]
-    return blocks
+                    block[r, c] += j_point[0, r] * j_point[0, c] + j_point[1, r] * j_point[1, c]
+            x, y, z = _turned_back(bodies[i], points[j, 0], points[j, 1], points[j, 2])
+            x, y, z = x - mountings[i, 0, 3], y - mountings[i, 1, 3], z - mountings[i, 2, 3]
+            nearest = min(nearest, np.sqrt(x * x + y * y + z * z))
+        if first[j + 1] > first[j]:
+            # The least known direction has the smallest eigenvalue.
+            least = max(_smallest_eigenvalue(block), _LEAST_INFORMATION)
+            out[j] = 1.0 / (np.sqrt(least) * nearest)
+    return out
+
+
+@compiled
+def _smallest_eigenvalue(a: Array) -> float:
+    """Return that of a symmetric 3x3 matrix, in closed form (Smith 1961)."""
+    mean = (a[0, 0] + a[1, 1] + a[2, 2]) / 3.0
+    d0, d1, d2 = a[0, 0] - mean, a[1, 1] - mean, a[2, 2] - mean
+    b0, b1, b2 = a[0, 1], a[0, 2], a[1, 2]
+    size = np.sqrt((d0 * d0 + d1 * d1 + d2 * d2 + 2.0 * (b0 * b0 + b1 * b1 + b2 * b2)) / 6.0)
+    if size == 0.0:
+        return float(mean)
+    determinant = (
+        d0 * (d1 * d2 - b2 * b2) - b0 * (b0 * d2 - b2 * b1) + b1 * (b0 * b2 - d1 * b1)
+    ) / size**3
+    angle = np.arccos(min(max(determinant / 2.0, -1.0), 1.0)) / 3.0
+    return float(mean + 2.0 * size * np.cos(angle + 2.0 * np.pi / 3.0))
 
 
 @compiled

@@ -20,7 +20,7 @@ from vcl_companion.vision.bundle import (
     adjust,
     matrices_of,
     observations_of,
-    point_information,
+    relative_sigmas,
 )
 from vcl_companion.vision.essential import sampson_px
 from vcl_companion.vision.features import Features
@@ -92,7 +92,7 @@ def _adjust(points: Array) -> None:
         distances=(Distance(0, 1, 1.0, 0.01),),
     )
     adjust(views, BundleOptions(max_iterations=2))
-    point_information(views)
+    relative_sigmas(views)
     ray_angles(list(bodies), points, np.ones((len(points), 2), dtype=np.bool_))
     n = len(points)
     near = np.tile(np.arange(4, dtype=np.int64), (n, 1))
