@@ -98,8 +98,9 @@ class MapExtension:
             if not left_out or current is None:
                 return is_from_new_places
             await self._delivered(current)
-            if await self._is_wanted_again(current):
-                left_out = [frame for frame in left_out if frame.drone_id in lost]
+            of_lost = [frame for frame in left_out if frame.drone_id in lost]
+            if len(of_lost) < len(left_out) and await self._is_wanted_again(current):
+                left_out = of_lost
             if not left_out:
                 return is_from_new_places
             return await self._extend_by_features(current, left_out, request_id) or (
