@@ -40,6 +40,12 @@ class Member:
             self.group, self.maps, log, work, disk, passed, lambda: None, falls_back=True
         )
 
+    def want_more(self, own: MapState, peer: MapState) -> None:
+        """Have its map indexed further, where both say so of themselves."""
+        self.group.set_own_state(own)
+        self.group.map_state(1, peer, 0.0)
+        self.maps.want_more()
+
 
 @asynccontextmanager
 async def indexing(path: Path) -> AsyncIterator[Member]:
@@ -63,9 +69,7 @@ def test_a_map_that_is_about_to_be_replaced_is_indexed_when_nobody_wants_that(
 ) -> None:
     async def scenario() -> None:
         async with indexing(tmp_path) as member:
-            member.group.set_own_state(own)
-            member.group.map_state(1, peer, 0.0)
-            member.maps.want_more()
+            member.want_more(own, peer)
             await asyncio.sleep(1.0)
             assert not member.maps.is_improved
             member.group.set_own_state(ENOUGH)
@@ -83,9 +87,7 @@ def test_where_somebody_is_lost_the_map_is_indexed_though_the_next_is_wanted(
 ) -> None:
     async def scenario() -> None:
         async with indexing(tmp_path) as member:
-            member.group.set_own_state(own)
-            member.group.map_state(1, peer, 0.0)
-            member.maps.want_more()
+            member.want_more(own, peer)
             await until(lambda: member.maps.is_improved)
 
     run(scenario())

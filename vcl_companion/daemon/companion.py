@@ -140,19 +140,23 @@ class Companion:
         if isinstance(fix, Localized) or not follows:
             self._estimator.in_sight.seen_on = stored.revision
         if isinstance(fix, NotLocalized) and follows:
-            if self._catching_up.is_under_way:
-                await self._waits.unless_newer(frame, self._catching_up.ended())
-                if not (self._catching_up.is_under_way or self._mailbox.has_had_newer(frame)):
-                    return await self._localize(frame, self._maps.current or stored)
+            if self._catching_up.is_under_way and await self._is_led(frame, self._catching_up):
+                return await self._localize(frame, self._maps.current or stored)
             search = self._map_search
             if search.is_under_way:
-                # What is found there leads this frame too, if it is still the newest then.
-                await self._waits.unless_newer(frame, search.ended())
-                if not (search.is_under_way or self._mailbox.has_had_newer(frame)):
+                if await self._is_led(frame, search):
                     return await self._localize(frame, self._maps.current or stored)
             elif search.is_due(stored, look.began_at_s):
                 return search.begin(frame, ned_from_body, stored, look.began_at_s)
         return await self._ask(frame, ned_from_body, stored, refused)
+
+    async def _is_led(self, frame: Frame, leading: CatchingUp | MapSearch) -> bool:
+        """Wait until older frames are looked for no more; whether what was found leads this one.
+
+        That is if it is still the newest then.
+        """
+        await self._waits.unless_newer(frame, leading.ended())
+        return not (leading.is_under_way or self._mailbox.has_had_newer(frame))
 
     async def _search(self, sought: Sought) -> AskedPeers | Sought | None:
         """Look for a frame by its features; the rest is as for any other.

@@ -27,6 +27,8 @@ _MAX_CONTRADICTED = 5
 HISTORY_S = 5.0
 # How far back frames may still be found that were lost beyond what the map showed then.
 LOST_S = 12.0
+# A frame that has come may be being looked at right now.
+_SETTLE_S = 0.5
 _LEAST_ARM_M = 1.0
 
 
@@ -96,6 +98,11 @@ class Estimator:
         """Whether a frame of the last two seconds gave a pose, by a fix or by a proposal."""
         state = self._history.newest
         return state is not None and now_ns - state.fixed_at_ns <= FRESH_NS
+
+    async def settled(self, at_ns: int, now_ns: int) -> None:
+        """Wait a moment until the frame of an instant has been looked at; not while we are lost."""
+        if self.is_localized(now_ns):
+            await self.in_sight.looked_at(at_ns, _SETTLE_S)
 
     @property
     def sigma_m(self) -> float:

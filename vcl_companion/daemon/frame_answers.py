@@ -27,8 +27,6 @@ from vcl_companion.wire.messages import FrameRequest
 
 _log = logging.getLogger(__name__)
 
-# The frame may be being looked at right now.
-_SETTLE_S = 0.5
 # Only a coordinator asks; while the swarm does not agree who that is there may be two.
 _MAX_ASKERS = 4
 
@@ -197,8 +195,7 @@ class FrameAnswers:
     async def detail(self, frame: Frame) -> Detail:
         """Return how much of one of our frames the map in use is extended by."""
         at_ns = frame.captured_at_ns
-        if self._estimator.is_localized(self._clock.now_ns()):
-            await self._estimator.in_sight.looked_at(at_ns, _SETTLE_S)
+        await self._estimator.settled(at_ns, self._clock.now_ns())
         stored = self._maps.current
         if stored is None:
             return "all"

@@ -17,8 +17,6 @@ from vcl_companion.mapping.landmark_map import LandmarkMap
 FURTHEST_BACK_NS = round(LOST_S * 1e9)
 """How much older than asked for a frame may be that says where it was taken."""
 
-# The frame may be being looked at right now.
-_SETTLE_S = 0.5
 # What was taken so soon after a keyframe shows no more than that.
 _LATER_NS = 50_000_000
 
@@ -64,16 +62,16 @@ class FrameChoice:
         if nearest is None or self._maps.current is None:
             return nearest
         until_ns = nearest.captured_at_ns
-        if self._estimator.is_localized(self._clock.now_ns()):
-            await self._estimator.in_sight.looked_at(until_ns, _SETTLE_S)
+        await self._estimator.settled(until_ns, self._clock.now_ns())
         stored = self._maps.current
         since_ns = max(until_ns - FURTHEST_BACK_NS, self._shown_until_ns(stored.index.landmark_map))
-        for frame in reversed(self._frames.after(since_ns)):
-            if frame.captured_at_ns > until_ns:
-                continue
-            if self._estimator.own_fix_at(frame.captured_at_ns) is not None:
-                return frame
-        return nearest
+        found = (
+            frame
+            for frame in reversed(self._frames.after(since_ns))
+            if frame.captured_at_ns <= until_ns
+            and self._estimator.own_fix_at(frame.captured_at_ns) is not None
+        )
+        return next(found, nearest)
 
     def _shown_until_ns(self, landmark_map: LandmarkMap) -> int:
         """Return when our newest keyframe of a map was taken, and a moment; -1 without one."""

@@ -61,11 +61,14 @@ class FrameHistory:
 
     def after(self, at_ns: int) -> list[Frame]:
         """Return the frames captured after an instant, in the order of their time."""
-        frames = {f.captured_at_ns: f for f in self._all() if f.captured_at_ns > at_ns}
-        return [frames[captured_at_ns] for captured_at_ns in sorted(frames)]
+        later = (f for f in self._all() if f.captured_at_ns > at_ns)
+        return sorted(later, key=lambda f: f.captured_at_ns)
 
     def _all(self) -> list[Frame]:
-        return [*self._sparse, *self._kept, *([self._newest] if self._newest else [])]
+        frames = [*self._sparse, *self._kept]
+        if self._newest is not None and self._newest is not frames[-1]:
+            frames.append(self._newest)
+        return frames
 
     def has(self, at_ns: int) -> bool:
         """Return whether the frame of an instant is here."""
