@@ -22,7 +22,14 @@ from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.growth import Growth, keyframe_of
 from vcl_companion.mapping.known_features import Index
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
-from vcl_companion.mapping.new_landmarks import Shown, free_of, new_landmarks, shown, with_room
+from vcl_companion.mapping.new_landmarks import (
+    Shown,
+    depth_range,
+    free_of,
+    new_landmarks,
+    shown,
+    with_room,
+)
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.partners import partners
 from vcl_companion.mapping.patch_table import (
@@ -178,8 +185,9 @@ class Extension:
             shown_by[c] = with_room(views[c], taken_px, self._cameras[c], per_cell)
             known = table.points[np.isfinite(table.observed[:, c, 0])]
             known = known[np.isfinite(known[:, 0])]
+            inverse_depths = depth_range(cams[c].inverse(), known)
             observed, points = new_landmarks(
-                c, others, shown_by, self._cameras, cams, known, self._table
+                c, others, shown_by, self._cameras, cams, inverse_depths, self._table
             )
             kept = spread(observed[:, [c]], [self._cameras[c]], per_cell)
             observed, points = observed[kept], points[kept]

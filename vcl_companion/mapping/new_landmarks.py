@@ -80,7 +80,7 @@ def new_landmarks(
     views: dict[int, Shown],
     cameras: list[Camera],
     worlds_from_cams: list[Pose],
-    known_points: Array,
+    inverse_depths: tuple[float, float],
     table: PatchTable,
 ) -> tuple[Array, Array]:
     """Find landmarks of one view's features in others.
@@ -91,7 +91,7 @@ def new_landmarks(
         views: the features of all of them that are no landmark yet.
         cameras: of all V views.
         worlds_from_cams: where they were taken.
-        known_points: (N, 3) landmarks that the source shows already, for the range of depth.
+        inverse_depths: least and largest that the source may show, 1/m (``depth_range``).
         table: all images.
 
     Returns:
@@ -99,7 +99,6 @@ def new_landmarks(
         found by its patch in one target at least.
     """
     world_from_a = worlds_from_cams[source]
-    inverse_depths = depth_range(world_from_a.inverse(), known_points)
     own, rows, depths = views[source], [], []
     for t in targets:
         b_from_a = worlds_from_cams[t].inverse() @ world_from_a
