@@ -25,8 +25,8 @@ class FrameRow(msgspec.Struct, frozen=True):
     """What became of one frame, and how long it took from its arrival to that.
 
     ``latency_ms`` is None for a frame that was never looked at; ``by`` is what the pose
-    sent for it relies on, "patches", "features", "peer" or "motion", None when none was: a
-    localized frame then has the ``reason`` why the autopilot did not need it.
+    sent for it relies on, "patches", "features", "odometry", "peer" or "motion", None when none
+    was: a localized frame then has the ``reason`` why the autopilot did not need it.
     """
 
     sequence: int

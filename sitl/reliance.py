@@ -15,12 +15,13 @@ from sitl.flight_log import FrameRow
 from sitl.plotting import INK, REFUSED, STYLE, WIDTH_IN, colour, seconds, svg
 from sitl.result import FlightResult
 
-Reliance = Literal["patches", "features", "peer", "motion", "nothing"]
+Reliance = Literal["patches", "features", "odometry", "peer", "motion", "nothing"]
 
 # Told apart by how light they are, too: what is darker stands firmer, red stands out.
 RELIANCES: dict[Reliance, tuple[str, str]] = {
     "patches": ("map, by patches", "#1b4f72"),
     "features": ("map, by features", "#6fa8d6"),
+    "odometry": ("own frames", "#5aa786"),
     "peer": ("a peer's word", "#b48ac0"),
     "motion": ("attitude and motion", "#f2c14e"),
     "nothing": ("nothing was sent", REFUSED),

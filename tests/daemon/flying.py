@@ -17,6 +17,7 @@ from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.odometry import Odometry
 from vcl_companion.daemon.own_fixes import OwnFixes
 from vcl_companion.daemon.peer_poses import PeerPoses
 from vcl_companion.localization.localization_options import LocalizationOptions
@@ -86,6 +87,7 @@ async def flying(
             drone.log,
             stack.enter_context(ThreadPoolExecutor(1)),
             options,
+            Odometry(sensor, drone.system_id, work),
         )
         companion = Companion(
             camera,

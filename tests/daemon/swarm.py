@@ -31,6 +31,7 @@ from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.message_requests import MessageRequests
+from vcl_companion.daemon.odometry import Odometry
 from vcl_companion.daemon.onboard_computer import OnboardComputer
 from vcl_companion.daemon.own_fixes import OwnFixes
 from vcl_companion.daemon.peer_poses import PeerPoses
@@ -233,6 +234,7 @@ class Flyer(Drone):
             own_fixes = OwnFixes(
                 sensor, self.autopilot_link, self.maps, self.estimator, self.log, executor,
                 PipelineOptions(demo.FEATURES, LocalizationOptions(), TrackingOptions()),
+                Odometry(sensor, self.system_id, self.work),
             )  # fmt: skip
             companion = Companion(
                 source, FrameOutcomes(source, self.clock, health, self.log), own_fixes,

@@ -34,6 +34,7 @@ from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.inter_target import Asked, InterTarget
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.odometry import Odometry
 from vcl_companion.daemon.own_fixes import OwnFixes
 from vcl_companion.daemon.peer_poses import AskedPeers, PeerPoses
 from vcl_companion.daemon.teller import Teller
@@ -199,7 +200,9 @@ async def flight(
         asked: list[int] = []
         inter = target_of(peers, asked, work, clock, estimator)
         peer_poses = PeerPoses(inter, maps, estimator, log)
-        own_fixes = OwnFixes(sensor, link, maps, estimator, log, executor, OPTIONS)
+        own_fixes = OwnFixes(
+            sensor, link, maps, estimator, log, executor, OPTIONS, Odometry(sensor, DRONE, work)
+        )
         estimator.keep_of(history.has)
         companion = Companion(
             camera, outcomes, own_fixes, CatchingUp(history, maps, estimator, own_fixes),

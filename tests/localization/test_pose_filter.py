@@ -658,3 +658,51 @@ def test_options_must_be_positive(name: str) -> None:
         FilterOptions(**{name: 0.0})
     with pytest.raises(ValueError, match="attitude_turn_error must lie in"):
         FilterOptions(attitude_turn_error=1.0)
+
+
+def test_maps_of_own_views_are_no_witnesses_of_where_they_are() -> None:
+    """A drone goes on from one to the next: it errs as they do, no less for how many they are."""
+    known = np.zeros((12, 12))
+    known[6:, 6:] = np.diag([0.2**2] * 3 + [0.01**2] * 3)
+    lever = np.hstack([np.zeros((6, 6)), np.eye(6)])
+    sharp = np.repeat([0.003, 0.0005], 3)
+    pose, velocity = Pose.identity(), np.array([2.0, -1.0, 0.0])
+    first = fix_at(pose, sharp, lever=lever, keyframe_covariance=known)
+    state = started(first, 0, pose.rotation, STEADY)
+    for k in range(1, 41):
+        pose = Pose(np.eye(3), k * STEP_S * velocity)
+        # Another map each time: of one's own views it is as vague as the last one.
+        keyframes = known * (1.0 + 1e-9 * k)
+        fix = fix_at(pose, sharp, lever=lever, keyframe_covariance=keyframes)
+        predicted = predict(state, k * STEP_NS, pose.rotation, STEADY)
+        state = updated(predicted, replace(fix, by="odometry"))
+    sigma_m = np.sqrt(np.diag(state.pose_covariance())[:3])
+    assert np.all(np.abs(sigma_m - 0.2) < 0.005)
+    # Frame by frame these err alike, so that how fast it flies is known all the same.
+    np.testing.assert_allclose(state.velocity_world, velocity, atol=0.05)
+    assert np.all(np.sqrt(np.diag(state.velocity_covariance())) < 0.2)
+
+
+def test_a_map_of_own_views_is_followed_where_the_state_knows_better() -> None:
+    """Found by the swarm's map again for a moment, then on by own views that have drifted."""
+    surer = np.zeros((12, 12))
+    surer[6:, 6:] = np.diag([0.01**2] * 3 + [0.001**2] * 3)
+    vague = np.zeros((12, 12))
+    vague[6:, 6:] = np.diag([0.3**2] * 3 + [0.002**2] * 3)
+    lever = np.hstack([np.zeros((6, 6)), np.eye(6)])
+    sharp = np.repeat([0.003, 0.0005], 3)
+    velocity = np.array([2.0, -1.0, 0.0])
+    on_map = fix_at(Pose.identity(), sharp, lever=lever, keyframe_covariance=surer)
+    state = started(on_map, 0, np.eye(3), STEADY)
+    for k in range(1, 8):
+        pose = Pose(np.eye(3), k * STEP_S * velocity)
+        fix = fix_at(pose, sharp, lever=lever, keyframe_covariance=surer)
+        state = updated(predict(state, k * STEP_NS, np.eye(3), STEADY), fix)
+    drifted = Pose(np.eye(3), 8 * STEP_S * velocity + np.array([0.3, 0.2, 0.0]))
+    own = replace(fix_at(drifted, sharp, lever=lever, keyframe_covariance=vague), by="odometry")
+    after = updated(predict(state, 8 * STEP_NS, np.eye(3), STEADY), own)
+    assert after.n_jumps == state.n_jumps
+    assert_pose_close(after.world_from_body, drifted, within_m=0.02, within_rad=0.01)
+    assert np.all(np.sqrt(np.diag(after.pose_covariance())[:3]) > 0.25)
+    np.testing.assert_allclose(after.velocity_world, velocity, atol=0.05)
+    assert np.all(np.sqrt(np.diag(after.velocity_covariance())) < 0.5)

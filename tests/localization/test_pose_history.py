@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -62,6 +64,36 @@ def advance(history: PoseHistory, k: int, fix: Localized) -> None:
 def newest(history: PoseHistory) -> FilterState:
     assert history.newest is not None
     return history.newest
+
+
+def test_what_own_frames_told_gives_way_to_the_map_whenever_that_comes() -> None:
+    """A drone beyond the map goes on by its own frames, which drift; then a map shows the place."""
+    history, _ = flown(np.random.default_rng(3), 5)
+    drift = np.array([0.3, 0.2, 0.0])
+    for k in range(5, 10):
+        truth = truth_at(k)
+        drifted = fix_at(Pose(truth.rotation, truth.translation + drift))
+        vague = drifted.keyframe_covariance * 1e3
+        advance(history, k, replace(drifted, by="odometry", keyframe_covariance=vague))
+    assert history.own_fix_at(4 * FRAME_NS) is not None
+    # It is not the map that it was found by there.
+    assert history.fix_at(7 * FRAME_NS) is None
+    assert history.own_fix_at(7 * FRAME_NS) is None
+    before = newest(history)
+    for k in range(5, 10):
+        found = history.refit(k * FRAME_NS, fix_at(truth_at(k), 0.005))
+        assert isinstance(found, FilterState)
+        assert_pose_close(found.world_from_body, truth_at(k), within_m=0.02, within_rad=0.01)
+        assert history.own_fix_at(k * FRAME_NS) is not None
+        # What the map has said once is not said again.
+        assert history.refit(k * FRAME_NS, fix_at(truth_at(k))) is None
+    after = newest(history)
+    assert_pose_close(after.world_from_body, truth_at(9), within_m=0.02, within_rad=0.01)
+    assert after.n_jumps == before.n_jumps
+    # And how fast it flies is known by it: five places in a second.
+    speed = np.sqrt(np.diag(after.velocity_covariance()))
+    assert np.all(speed < 0.6)
+    np.testing.assert_allclose(after.velocity_world, [1.5, 0.5, 0.0], atol=0.1)
 
 
 def sharp(sigma_m: float = 0.005) -> Array:

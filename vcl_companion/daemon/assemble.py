@@ -36,6 +36,7 @@ from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.memory_watch import MemoryWatch
 from vcl_companion.daemon.message_requests import MessageRequests
+from vcl_companion.daemon.odometry import Odometry
 from vcl_companion.daemon.onboard_computer import OnboardComputer
 from vcl_companion.daemon.own_fixes import OwnFixes
 from vcl_companion.daemon.peer_poses import PeerPoses
@@ -216,7 +217,8 @@ async def _run(config: Config) -> int:
         rng,
     )
     teller = Teller(autopilot, estimator, clock, log, told)
-    own_fixes = OwnFixes(sensor, autopilot, maps, estimator, log, vision, pipeline)
+    odometry = Odometry(sensor, config.system_id, work)
+    own_fixes = OwnFixes(sensor, autopilot, maps, estimator, log, vision, pipeline, odometry)
     companion = Companion(
         camera,
         outcomes,

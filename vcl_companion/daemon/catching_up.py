@@ -69,10 +69,11 @@ class CatchingUp:
 
     async def _follow(self, stored: StoredMap) -> None:
         """Follow the frames since the last fix, if there are any, on a map."""
-        in_sight, fixed_at_ns = self._estimator.in_sight, self._estimator.last_own_fix.at_ns
-        if fixed_at_ns is None or stored.templates is None:
+        in_sight = self._estimator.in_sight
+        shown_at_ns = in_sight.shown_at_ns
+        if shown_at_ns is None or stored.templates is None:
             return
-        behind = self._frames.after(fixed_at_ns)
+        behind = self._frames.after(shown_at_ns)
         n_looked = n_found = n_missed = 0
         for frame in behind:
             # What has not been looked at yet is not behind.

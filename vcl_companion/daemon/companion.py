@@ -107,6 +107,7 @@ class Companion:
         async with asyncio.TaskGroup() as beside:
             beside.create_task(self._teller.run())
             beside.create_task(self._catching_up.run())
+            beside.create_task(self._own_fixes.run())
             while True:
                 await self._take_next(beside)
 
@@ -137,6 +138,8 @@ class Companion:
         stored, fix, ned_from_body = look.stored, look.fix, look.ned_from_body
         follows = stored.templates is not None
         refused = self._take(frame, fix, ned_from_body)
+        if refused is None:
+            self._own_fixes.note(frame, look)
         if isinstance(fix, Localized) or not follows:
             self._estimator.in_sight.seen_on = stored.revision
         if isinstance(fix, NotLocalized) and follows:

@@ -132,13 +132,14 @@ class Estimator:
         self._history.clear()
         self._n_contradicted = 0
         self.last_own_fix.forget()
+        self.in_sight.shown_at_ns = None
 
     def own_fix_at(self, at_ns: int) -> FilterState | None:
-        """Return what was believed at a frame that had a fix of its own; None at any other."""
+        """Return what was believed at a frame that had a fix on the map; None at any other."""
         return self._history.own_fix_at(at_ns)
 
     def fix_at(self, at_ns: int) -> Localized | None:
-        """Return what a frame gave of its own; None when that was nothing."""
+        """Return what a frame gave on the map; None when that was nothing."""
         return self._history.fix_at(at_ns)
 
     def predicted(self, at_ns: int, ned_from_body: Array | None) -> FilterState | None:
@@ -247,7 +248,7 @@ class Estimator:
         self._has_begun = True
         self._history.append(state, fix, ned_from_body)
         self.last_own_fix.note(state)
-        self.in_sight.note(at_ns, fix)
+        self.in_sight.note(at_ns, fix if fix.is_on_map else None)
         return state
 
     def _take_late(self, fix: Localized, at_ns: int) -> FilterState | NotLocalized:
@@ -265,6 +266,7 @@ class Estimator:
             self._relocalized(fix)
         self._n_contradicted = 0
         self._has_begun = True
+        self.in_sight.note_shown(at_ns)
         self.last_own_fix.note(state)
         return state
 

@@ -131,7 +131,7 @@ class Exchange:
         )
         self.frames = FrameHistory()
         """Our own of the last seconds."""
-        self._last_own_fix = estimator.last_own_fix
+        self._in_sight = estimator.in_sight
         estimator.keep_of(self.frames.has)
         choice = FrameChoice(system_id, self.frames, maps, estimator, clock)
         self._passed = PassedFrames(
@@ -268,7 +268,7 @@ class Exchange:
 
     def on_frame(self, frame: Frame) -> None:
         """Keep a frame of our own for peers, and for a first map."""
-        self.frames.add(frame, self._last_own_fix.at_ns)
+        self.frames.add(frame, self._in_sight.shown_at_ns)
 
     def on_heartbeat(self, peer: int) -> None:
         """Note a sign of life."""

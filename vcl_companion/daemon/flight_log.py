@@ -26,8 +26,8 @@ PoseSource = Literal["intra", "inter", "fused"]
 """Whence a localized frame's pose: its own fix, a peer's proposal, or both."""
 
 Basis = Recognised | Literal["peer", "motion"]
-"""What a sent pose relies on: the map by patches or by features, a peer's word alone, or
-attitude and motion since the last of these. Where there is none, nothing was sent."""
+"""What a sent pose relies on: the map by patches or by features, our own last frames, a peer's word
+alone, or attitude and motion since the last of these. Where there is none, nothing was sent."""
 
 _UPPER = np.triu_indices(6)
 # Reasons hold numbers, and some are a peer's words: beyond so many they share one count.

@@ -23,7 +23,7 @@ FURTHEST_NS = 1_000_000_000
 class FrameHistory:
     """Keeps about the last two seconds, and of the ten before them one a second.
 
-    Of who is lost five a second, since the last fix.
+    Of who is beyond the map five a second, since the last fix on it.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class FrameHistory:
 
         Args:
             frame: not before the last one.
-            fixed_at_ns: of the last frame that had a fix; None where none had.
+            fixed_at_ns: of the last frame that had a fix on the map; None where none had.
         """
         self._newest = frame
         if self._kept and abs(frame.captured_at_ns - self._kept[-1].captured_at_ns) < _SPACING_NS:

@@ -30,11 +30,6 @@ class LastOwnFix:
         self._speed_m_s = speed_m_s
         self._state: FilterState | None = None
 
-    @property
-    def at_ns(self) -> int | None:
-        """When it was; None without one."""
-        return None if self._state is None else self._state.at_ns
-
     def note(self, state: FilterState) -> None:
         """Take the state after a frame that gave a fix; an older one changes nothing."""
         if self._state is None or state.at_ns >= self._state.at_ns:

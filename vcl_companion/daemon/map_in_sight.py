@@ -19,6 +19,7 @@ class MapInSight:
         tracked: landmarks of the map that the last frame showed; 0 when it was refused.
         covered: share of the last frame that they filled; 0 when it was refused.
         novelty_deg: how differently they looked there from how they are remembered, degrees.
+        shown_at_ns: when the last frame was taken that showed it; None where none has.
         seen_on: revision of the map that the last frame was looked at on.
         beyond: revision of the map that was followed as far as it shows, the last frame being
             beyond that.
@@ -30,6 +31,7 @@ class MapInSight:
         self.tracked = 0
         self.covered = 0.0
         self.novelty_deg = 0.0
+        self.shown_at_ns: int | None = None
         self.seen_on = b""
         self.beyond = b""
         self.sought_since_s: float | None = None
@@ -43,8 +45,13 @@ class MapInSight:
         else:
             self.tracked, self.covered = fix.n_seen, fix.covered
             self.novelty_deg = fix.novelty_deg
+            self.note_shown(at_ns)
         self._looked_at_ns = at_ns
         self._looked.set()
+
+    def note_shown(self, at_ns: int) -> None:
+        """Note that the frame of an instant showed the map; an older one changes nothing."""
+        self.shown_at_ns = max(at_ns, self.shown_at_ns or 0)
 
     def is_being_sought(self, now_s: float) -> bool:
         """Whether what the frames show will be known in a moment.

@@ -12,7 +12,7 @@ from vcl_companion.daemon.forked import Forked, ProcessLostError
 from vcl_companion.daemon.map_offer import HandOut, MapOffer, ReadyMap
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.worker import Worker
-from vcl_companion.daemon.workshop import NotHereError, Workshop
+from vcl_companion.daemon.workshop import NotHereError, OwnImage, Workshop
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.detail import Detail
 from vcl_companion.localization.filter_state import FilterState
@@ -20,7 +20,9 @@ from vcl_companion.localization.fix import Localized, NotLocalized, Prior
 from vcl_companion.localization.inter import NoProposal, Proposal
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pipeline import Effort
+from vcl_companion.mapping.given_depths import SceneDepth
 from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.local_map import LocalMap
 from vcl_companion.mapping.options import NoMap
 from vcl_companion.mapping.seen_landmarks import SeenLandmarks
 from vcl_companion.vision.features import Image
@@ -29,14 +31,15 @@ from vcl_companion.wire.frame_codec import FrameAnswer
 _log = logging.getLogger(__name__)
 
 _FIRST, _MAPS, _IMAGES, _FRAMES, _PEERS = "first", "maps", "images", "frames", "peers"
-_SPARE = "spare"
-# Niceness of each above the frames that are followed. Who is lost leaves the map that will show
-# where as much time as it takes; with half of these peers would get half of the machine's.
+_OWN, _SPARE = "own", "spare"
+# Niceness of each above the frames that are followed. Who leaves the map's sight goes on by what is
+# made of the last frames, in a thirtieth of a second: at once. Who is lost leaves the map that will
+# show where as much time as it takes; with half of these peers would get half of the machine's.
 # Without the whole of a map nothing goes before it; for others who have none ours goes as our
 # images do. An index of another kind, five seconds' work that only who is lost waits for, comes
 # last, but is no nicer than that: a thread that gets no processor while it holds the
 # interpreter's lock holds up all others (of 19, for a hundred milliseconds at a time).
-_LANES = {_FIRST: 2, _MAPS: 8, _IMAGES: 4, _FRAMES: 8, _PEERS: 12, _SPARE: 12}
+_LANES = {_FIRST: 2, _OWN: 2, _MAPS: 8, _IMAGES: 4, _FRAMES: 8, _PEERS: 12, _SPARE: 12}
 
 
 class MapWork:
@@ -75,6 +78,15 @@ class MapWork:
         """See ``Workshop``."""
         signature: bytes = await self._do(_PEERS, "signature", image)
         return signature
+
+    async def local_map(
+        self, views: list[OwnImage], covariance: Array, drone_id: int, scene: SceneDepth
+    ) -> LocalMap | NoMap:
+        """See ``Workshop``."""
+        made: LocalMap | NoMap = await self._do(
+            _OWN, "local_map", views, covariance, drone_id, scene
+        )
+        return made
 
     async def look_at(self, frame: FrameAnswer) -> None:
         """See ``Workshop``."""

@@ -11,11 +11,19 @@ from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.daemon.odometry import Odometry
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized, NotLocalized
-from vcl_companion.localization.pipeline import Effort, PipelineOptions, is_doubtful, localize
+from vcl_companion.localization.pipeline import (
+    Effort,
+    PipelineOptions,
+    follow,
+    is_doubtful,
+    localize,
+)
+from vcl_companion.mapping.templates import Templates
 from vcl_companion.recording.sensor import Sensor
 
 # How long an attitude sample may still be on its way when its frame is here.
@@ -34,12 +42,20 @@ class Look:
         ned_from_body: (3, 3) the frame's attitude, or None.
         fix: where it was taken, or why that cannot be said.
         began_at_s: by the loop's time.
+        local: the local map that it was looked at on as well, if it was.
     """
 
     stored: StoredMap
     ned_from_body: Array | None
     fix: Localized | NotLocalized
     began_at_s: float
+    local: Templates | None = None
+
+    @property
+    def seen(self) -> Templates | None:
+        """What the fix rests on; None for features."""
+        is_on_map = isinstance(self.fix, NotLocalized) or self.fix.is_on_map
+        return self.stored.templates if is_on_map else self.local
 
 
 class OwnFixes:
@@ -53,6 +69,7 @@ class OwnFixes:
         log: told of every fix.
         executor: runs the vision.
         options: of the steps.
+        odometry: knows our own last frames, to go on by.
     """
 
     def __init__(
@@ -64,6 +81,7 @@ class OwnFixes:
         log: FlightLog,
         executor: Executor,
         options: PipelineOptions,
+        odometry: Odometry,
     ) -> None:
         self._sensor = sensor
         self._autopilot = autopilot
@@ -72,12 +90,18 @@ class OwnFixes:
         self._log = log
         self._executor = executor
         self._options = options
+        self._odometry = odometry
         self._doubted_at_s = -math.inf
+
+    async def run(self) -> None:
+        """Make local maps of our own frames when they are wanted, until cancelled."""
+        await self._odometry.run()
 
     async def look(self, frame: Frame, stored: StoredMap) -> Look:
         """Look at a frame on a map: by its patches, or all over it where it has none.
 
-        Where the world of that map is left meanwhile, on the one that is in use then.
+        Where the world of that map is left meanwhile, on the one that is in use then. Where it
+        hardly shows the frame, by our own last frames.
         """
         while True:
             ned_from_body = await self._attitude_of(frame)
@@ -90,7 +114,34 @@ class OwnFixes:
             stored = self._maps.current or stored
         if isinstance(fix, Localized) and is_doubtful(fix):
             self._doubted_at_s = now_s
-        return Look(stored, ned_from_body, fix, now_s)
+        look = Look(stored, ned_from_body, fix, now_s)
+        return await self._by_odometry(frame, look) or look
+
+    async def _by_odometry(self, frame: Frame, on_map: Look) -> Look | None:
+        """Look at a frame by our own last frames, if these may tell more; None if they do not."""
+        local = self._odometry.templates
+        at_ns, ned_from_body = frame.captured_at_ns, on_map.ned_from_body
+        if local is None or not self._odometry.may_tell_more(on_map.fix):
+            return None
+        predicted = self._estimator.predicted(at_ns, ned_from_body)
+        if predicted is None:
+            return None
+        own = await asyncio.get_running_loop().run_in_executor(
+            self._executor,
+            follow,
+            frame.image,
+            self._sensor.camera,
+            self._sensor.body_from_cam,
+            local,
+            predicted.prior(),
+            ned_from_body,
+            self._options,
+        )
+        if isinstance(own, NotLocalized) or not self._odometry.tells_more(own, on_map.fix):
+            return None
+        if self._maps.has_left_world(on_map.stored.world):
+            return None
+        return replace(on_map, fix=replace(own, by="odometry"), local=local)
 
     async def look_by_patches(self, frame: Frame) -> Look | None:
         """Look at a frame by patches alone, once.
@@ -130,6 +181,13 @@ class OwnFixes:
             self._options,
             replace(effort, has_heading=self._estimator.has_heading),
         )
+
+    def note(self, frame: Frame, look: Look) -> None:
+        """Remember a frame whose fix was taken: we may have to go on by it."""
+        seen = look.seen
+        if isinstance(look.fix, Localized) and look.fix.by != "features" and seen is not None:
+            world = look.stored.world, self._estimator.n_resets
+            self._odometry.note(frame, look.fix, seen, world)
 
     def take(
         self, frame: Frame, fix: Localized, ned_from_body: Array | None

@@ -16,6 +16,7 @@ from vcl_companion.daemon.map_offer import HandOut, MapOffer, ReadyMap, ready_ma
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.peer_look import PeerLook
 from vcl_companion.daemon.usage import give_back_freed
+from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.detail import Detail
 from vcl_companion.localization.filter_state import FilterState
@@ -25,14 +26,18 @@ from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pipeline import Effort, PipelineOptions, localize
 from vcl_companion.localization.seen_by_patches import seen_by_patches
 from vcl_companion.mapping.continuity import newest_part
+from vcl_companion.mapping.given_depths import SceneDepth
 from vcl_companion.mapping.keyframe_image import encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.local_map import LocalMap, OwnView, local_map
+from vcl_companion.mapping.new_landmarks import Shown, shown
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.seen_landmarks import SeenLandmarks
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.vision.features import Detector, FeatureOptions, Image, detect
 from vcl_companion.vision.focus import focused
+from vcl_companion.vision.patches import pyramid_of
 from vcl_companion.vision.signature import signature_of
 from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
@@ -47,6 +52,25 @@ _N_NEW_IMAGES = 16
 _MOST_SEEN = 1000
 # Less of a map would not tell where one is.
 _LEAST_KEYFRAMES, _LEAST_LANDMARKS = 2, 100
+
+
+# Of our own frames, which are a moment apart: quickly found, and enough in each part of the image.
+_OWN_FEATURES = FeatureOptions(max_features=600)
+
+
+@dataclass(frozen=True, eq=False)
+class OwnImage:
+    """One of our own frames as a local map is made of it.
+
+    Attributes:
+        captured_at_ns: when, our clock.
+        image: (H, W) uint8.
+        world_from_body: where.
+    """
+
+    captured_at_ns: int
+    image: Image
+    world_from_body: Pose
 
 
 class NotHereError(Exception):
@@ -93,6 +117,7 @@ class Workshop:
         self._look = PeerLook(sensor, features, options.inter, options.detectors, options.tracked)
         self._maps: dict[bytes, StoredMap] = {}
         self._encoded: tuple[bytes, LandmarkMap] | None = None
+        self._own_features: dict[int, Shown] = {}
 
     def learn(self, stored: StoredMap) -> None:
         """Take a map that was made elsewhere, or before this workshop was."""
@@ -149,6 +174,35 @@ class Workshop:
     def signature(self, image: Image) -> bytes:
         """Return what tells peers the place that an image shows; see ``signature_of``."""
         return signature_of(image)
+
+    def local_map(
+        self, views: list[OwnImage], covariance: Array, drone_id: int, scene: SceneDepth
+    ) -> LocalMap | NoMap:
+        """Make a map of our own last frames; see ``local_map``.
+
+        Args:
+            views: V of them, the newest first.
+            covariance: (6V, 6V) of their bodies' poses together.
+            drone_id: ours.
+            scene: how far what the newest one shows may be.
+        """
+        camera = self._sensor.camera
+        known = {view.captured_at_ns: self._own_features.get(view.captured_at_ns) for view in views}
+        self._own_features = {
+            view.captured_at_ns: known[view.captured_at_ns]
+            or shown(detect(view.image, "orb", _OWN_FEATURES), camera)
+            for view in views
+        }
+        own = [
+            OwnView(
+                view.captured_at_ns,
+                pyramid_of(view.image),
+                self._own_features[view.captured_at_ns],
+                view.world_from_body,
+            )
+            for view in views
+        ]
+        return local_map(own, covariance, camera, self._sensor.body_from_cam, drone_id, scene)
 
     def look_at(self, frame: FrameAnswer) -> None:
         """Decode a frame that a map will be made of, and find its features, before it is.

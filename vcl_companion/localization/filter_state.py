@@ -8,7 +8,8 @@ are *considered* (Schmidt 1966), that is, their correlation with the state is
 kept, while they themselves are not estimated.
 
 Error state: position (world), offset rotation (world), velocity (world), the
-attitude sample's own error (body, new in every frame), keyframe errors.
+attitude sample's own error (body, new in every frame), keyframe errors, 6V of the swarm's map;
+of a map of own views there is one more.
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, euler_from_matrix
 from vcl_companion.localization.localization_options import LocalizationOptions
 
-Recognised = Literal["patches", "features"]
-"""What a pose rests on: the map's patches, or a detector's features."""
+Recognised = Literal["patches", "features", "odometry"]
+"""What a pose rests on: the map's patches, a detector's features, or our own last frames alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +36,9 @@ class Localized:
         noise_covariance: (6, 6) local, from this image's pixel noise; new in every frame.
         own_map_covariance: (6, 6) local, from the used landmarks' own errors and
             from how differently they look from here.
-        map_lever: (6, 6V) local pose error per keyframe error of the map.
-        keyframe_covariance: (6V, 6V) of those.
+        map_lever: (6, 6V) local pose error per keyframe error of the map; by a map of own views
+            (6, 6V + 1), the last one per what was expected wrongly of all depths.
+        keyframe_covariance: (6V, 6V) of those, or as much more.
         n_matched: landmarks matched.
         n_inliers: of these, how many agree.
         guided: whether the prediction led the matching.
@@ -62,6 +63,11 @@ class Localized:
     covered: float = 0.0
     by: Recognised = "features"
     novelty_deg: float = 0.0
+
+    @property
+    def is_on_map(self) -> bool:
+        """Whether it is the swarm's map that was recognised."""
+        return self.by != "odometry"
 
     def covariance(self) -> Array:
         """Return (6, 6) the whole covariance of this pose alone, local."""

@@ -110,10 +110,7 @@ def localize(
         options = replace(options, localization=options.localization.of_any_heading())
     tracked: Localized | NotLocalized | None = None
     if templates is not None and prior is not None and effort.may_track:
-        tracked = _unless_by_chance(track(
-            image, camera, body_from_cam, templates, prior, ned_from_body,
-            options.tracking, options.localization, options.drone_id,
-        ))  # fmt: skip
+        tracked = follow(image, camera, body_from_cam, templates, prior, ned_from_body, options)
         if isinstance(tracked, Localized):
             if not (effort.may_doubt and is_doubtful(tracked)):
                 return tracked
@@ -134,6 +131,22 @@ def localize(
         )
         by = by.fallback
     return found
+
+
+def follow(
+    image: Image,
+    camera: Camera,
+    body_from_cam: Pose,
+    templates: Templates,
+    prior: Prior,
+    ned_from_body: Array | None,
+    options: PipelineOptions,
+) -> Localized | NotLocalized:
+    """Find the drone's pose by patches alone, near where it is expected; see ``localize``."""
+    return _unless_by_chance(track(
+        image, camera, body_from_cam, templates, prior, ned_from_body,
+        options.tracking, options.localization, options.drone_id,
+    ))  # fmt: skip
 
 
 def is_doubtful(fix: Localized) -> bool:

@@ -14,6 +14,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, log_so3
 from vcl_companion.localization.contradictions import reconciled
 from vcl_companion.localization.filter_state import (
+    GATE_POSE,
     N_OWN,
     OFFSET,
     POSITION,
@@ -27,6 +28,10 @@ from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.options import require_positive
 
 _MAX_COAST_S = 60.0
+# Where nothing is known of a position, 1 sigma.
+_ANYWHERE_M = 1e3
+# Of the sum of the keyframes' variances; rounding leaves more.
+_EXACT = 1e-12
 
 
 @dataclass(frozen=True)
@@ -168,12 +173,15 @@ def update(predicted: FilterState, fix: Localized) -> FilterState | NotLocalized
     Where it contradicts the prediction, it is refused, or of the prediction less is believed
     (``contradictions``).
     """
-    predicted = _with_map(predicted, fix)
+    before = predicted
+    predicted = _with_map(before, fix)
     measured = Measurement(
         predicted.world_from_body.local(fix.world_from_body),
         _observation(predicted, fix),
         fix.noise_covariance + fix.own_map_covariance,
     )
+    if not (fix.is_on_map or _is_on_map_of(before, fix)):
+        predicted = _on_own_views(before, fix, measured)
     believed = reconciled(predicted, fix, measured)
     if isinstance(believed, NotLocalized):
         return believed
@@ -218,12 +226,41 @@ def _observation(predicted: FilterState, fix: Localized) -> Array:
     return out
 
 
+def _on_own_views(state: FilterState, fix: Localized, measured: Measurement) -> FilterState:
+    """Return a state that goes on with a new map of our own views.
+
+    What that knows of where it is it has from the state that those views were found by: it is no
+    second witness, and errs as the state does, but for what has come since. Where the state has
+    learnt better meanwhile, which the fix then contradicts, only its speed is kept.
+    """
+    known, by_keys = state.covariance[:N_OWN, :N_OWN], state.covariance[:N_OWN, N_OWN:]
+    keys = state.covariance[N_OWN:, N_OWN:]
+    # The first keyframe of a map has no error: not to be inverted as it is.
+    certain = np.eye(len(keys)) * (_EXACT * max(float(np.trace(keys)), 1.0))
+    own = known - by_keys @ np.linalg.solve(keys + certain, by_keys.T)
+    lever = np.zeros((N_OWN, fix.map_lever.shape[1]))
+    rotation = state.world_from_body.rotation
+    lever[POSITION], lever[OFFSET] = -rotation @ fix.map_lever[:3], -rotation @ fix.map_lever[3:]
+    shared = lever @ fix.keyframe_covariance
+    covariance = np.block(
+        [[0.5 * (own + own.T) + shared @ lever.T, shared], [shared.T, fix.keyframe_covariance]]
+    )
+    expected, innovation = measured.expected_by(covariance), measured.innovation
+    if innovation @ np.linalg.solve(expected, innovation) > GATE_POSE:
+        for part, sigma in ((POSITION, _ANYWHERE_M), (OFFSET, np.pi)):
+            covariance[part] = covariance[:, part] = 0.0
+            covariance[part, part] = np.eye(3) * sigma**2
+    return replace(state, covariance=covariance)
+
+
+def _is_on_map_of(state: FilterState, fix: Localized) -> bool:
+    """Whether a state considers the errors of the very keyframes that a fix rests on."""
+    return np.array_equal(state.covariance[N_OWN:, N_OWN:], fix.keyframe_covariance)
+
+
 def _with_map(state: FilterState, fix: Localized) -> FilterState:
     """Return the state with the keyframe errors of the fix's map, new ones when it changed."""
-    known = state.covariance[N_OWN:, N_OWN:]
-    if known.shape == fix.keyframe_covariance.shape and np.array_equal(
-        known, fix.keyframe_covariance
-    ):
+    if _is_on_map_of(state, fix):
         return state
     n_map = fix.map_lever.shape[1]
     covariance = np.zeros((N_OWN + n_map, N_OWN + n_map))

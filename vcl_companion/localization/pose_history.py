@@ -30,6 +30,10 @@ class _Step:
     fix: Localized | None
     ned_from_body: Array | None
 
+    @property
+    def fix_on_map(self) -> Localized | None:
+        return self.fix if self.fix is not None and self.fix.is_on_map else None
+
 
 class PoseHistory:
     """States of the recent frames, in order.
@@ -70,13 +74,13 @@ class PoseHistory:
         return next(earlier, None)
 
     def own_fix_at(self, at_ns: int) -> FilterState | None:
-        """Return the state after the frame of an instant, if the frame gave a fix of its own."""
+        """Return the state after the frame of an instant, if the frame gave a fix on the map."""
         return None if self.fix_at(at_ns) is None else self.at(at_ns)
 
     def fix_at(self, at_ns: int) -> Localized | None:
-        """Return what the frame of an instant gave of its own; None when that was nothing."""
+        """Return what the frame of an instant gave on the map; None when that was nothing."""
         k = self._nearest(at_ns)
-        return None if k is None else self._steps[k].fix
+        return None if k is None else self._steps[k].fix_on_map
 
     def clear(self) -> None:
         """Forget everything: the state has begun anew."""
@@ -133,20 +137,28 @@ class PoseHistory:
         """Take in what a frame gave after later ones had been, and bring these up to date.
 
         Args:
-            at_ns: instant of the frame, which was kept without a fix then.
-            fix: what it gave.
+            at_ns: instant of the frame, which was kept without a fix on the map then.
+            fix: what it gave, on the map.
 
         Returns:
             The state of that instant with the fix in it, or how the fix contradicts it; None
             where it comes too late, or the frame has one.
         """
         k = self._nearest(at_ns)
-        if k is None or self._steps[k].fix is not None:
+        if k is None or self._steps[k].fix_on_map is not None:
             return None
-        updated = update(self._steps[k].state, fix)
+        step = self._steps[k]
+        state: FilterState | None = step.state
+        if step.fix is not None and k > 0:
+            # What our own frames told here went on from less than is known by now.
+            before = self._steps[k - 1].state
+            state = predict(before, step.state.at_ns, step.ned_from_body, self._options)
+        if state is None:
+            return None
+        updated = update(state, fix)
         if isinstance(updated, NotLocalized):
             return updated
-        if not self._replay(k, _Step(updated, fix, self._steps[k].ned_from_body)):
+        if not self._replay(k, _Step(updated, fix, step.ned_from_body)):
             return None
         return updated
 
@@ -168,7 +180,7 @@ class PoseHistory:
     def _forget_before(self, now_ns: int) -> None:
         """Let go of what is too old, but for what of it may still be found."""
         steps = self._steps
-        fixed_at_ns = next((s.state.at_ns for s in reversed(steps) if s.fix is not None), -1)
+        fixed_at_ns = next((s.state.at_ns for s in reversed(steps) if s.fix_on_map), -1)
         old: list[_Step] = []
         while steps[0].state.at_ns < now_ns - self._length_ns:
             old.append(steps.popleft())

@@ -1,0 +1,156 @@
+"""A drone that turns away from the map and goes on by its own frames, and its return."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from tests.checks import nees
+from tests.daemon import demo
+from tests.daemon.test_turning_away import OPTIONS, chart, n_in_view
+from tests.daemon.waiting import run
+from tests.localization.painted import MOUNTING, photograph
+from tests.scenes import PINHOLE
+from vcl_companion.cameras.source import Frame
+from vcl_companion.daemon.estimator import Estimator
+from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.odometry import Odometry
+from vcl_companion.daemon.workshop import WorkOptions, Workshop
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.rotation import Array, exp_so3, matrix_from_euler
+from vcl_companion.localization.filter_state import FilterState
+from vcl_companion.localization.fix import Localized, NotLocalized, Prior
+from vcl_companion.localization.pipeline import follow, localize
+from vcl_companion.localization.pose_filter import FilterOptions
+from vcl_companion.recording.sensor import Sensor
+from vcl_companion.swarm.pose_requests import InterMavOptions
+
+DRONE, PER_S, LENGTH_S = 7, 10, 9.0
+# Turned by 105 degrees and back; what the map shows is out of sight by 90.
+LEAVES_S, TURNS_S, RETURNS_S = 0.8, 3.4, 5.2
+MOTION = FilterOptions()
+SENSOR = Sensor(PINHOLE, MOUNTING, float(PER_S))
+
+
+def truth_at(at_s: float) -> Pose:
+    share = np.clip((at_s - LEAVES_S) / TURNS_S, 0, 1) - np.clip((at_s - RETURNS_S) / TURNS_S, 0, 1)
+    heading = float(np.deg2rad(105.0) * share**2 * (3.0 - 2.0 * share))
+    gone = np.array([-1.5 + 0.3 * at_s, 0.5 - 0.25 * at_s, -0.3])
+    return Pose(matrix_from_euler(0.02 * np.sin(3 * at_s), -0.03 * np.sin(2 * at_s), heading), gone)
+
+
+@dataclass(frozen=True, eq=False)
+class Flown:
+    """One frame: its truth, what was seen, and what was believed after it."""
+
+    at_s: float
+    fix: Localized | NotLocalized
+    state: FilterState | None
+    has_local_map: bool
+
+    @property
+    def error(self) -> Array:
+        assert self.state is not None, self.fix
+        return truth_at(self.at_s).local(self.state.world_from_body)
+
+
+async def flown(rng: np.random.Generator, *, goes_on: bool) -> list[Flown]:
+    """Fly there and back; with or without going on by own frames where the map ends."""
+    index, templates = chart()
+    work_options = WorkOptions((), demo.MAP_OPTIONS, OPTIONS, ("akaze",), InterMavOptions(), True)
+    work = MapWork(Workshop(SENSOR, work_options), forks=False)
+    odometry = Odometry(SENSOR, DRONE, work)
+    making = asyncio.create_task(odometry.run())
+    options = replace(OPTIONS, drone_id=DRONE)
+    estimator = Estimator(MOTION, OPTIONS.localization, lambda _: None)
+    out = []
+    for k in range(round(LENGTH_S * PER_S)):
+        at_s, at_ns = k / PER_S, round(k / PER_S * 1e9)
+        image = photograph(truth_at(at_s), rng)
+        attitude = truth_at(at_s).rotation @ exp_so3(0.005 * rng.standard_normal(3))
+        predicted = estimator.predicted(at_ns, attitude)
+        prior = predicted.prior() if predicted else None
+        given = image, PINHOLE, MOUNTING
+        fix, seen = localize(*given, index, templates, prior, attitude, options), templates
+        local = odometry.templates
+        if goes_on and local is not None and prior is not None and odometry.may_tell_more(fix):
+            own = follow(*given, local, prior, attitude, options)
+            if isinstance(own, Localized) and odometry.tells_more(own, fix):
+                fix, seen = replace(own, by="odometry"), local
+        state: FilterState | NotLocalized | None = None
+        if isinstance(fix, Localized):
+            state = estimator.take_fix(predicted, fix, at_ns, attitude)
+            if isinstance(state, FilterState) and fix.by != "features":
+                odometry.note(Frame(image, at_ns, k, 0), fix, seen, (b"world", 0))
+        else:
+            estimator.take_nothing(predicted, at_ns, attitude)
+        await odometry.settled()  # here, where no time passes, before the next frame
+        believed = state if isinstance(state, FilterState) else None
+        out.append(Flown(at_s, fix, believed, odometry.templates is not None))
+    making.cancel()
+    with suppress(asyncio.CancelledError):
+        await making
+    work.end()
+    return out
+
+
+def by(frame: Flown) -> str:
+    return frame.fix.by if isinstance(frame.fix, Localized) else ""
+
+
+def test_every_frame_is_found_though_the_map_ends() -> None:
+    frames = asyncio.run(flown(np.random.default_rng(5), goes_on=True))
+    assert min(n_in_view(truth_at(f.at_s)) for f in frames) < 15
+    away = [f for f in frames if by(f) == "odometry"]
+    assert len(away) >= 10
+    assert all(by(f) in ("patches", "odometry") for f in frames[1:])
+    squared = []
+    for f in away:
+        assert f.state is not None
+        assert np.linalg.norm(f.error[:3]) < 0.1
+        assert np.rad2deg(np.linalg.norm(f.error[3:])) < 0.3
+        squared.append(float(nees(f.error, f.state.pose_covariance())[0]))
+    # 99.99 % of chi^2 with 6 degrees of freedom.
+    assert max(squared) < 27.9
+    # Back on the map, it is that again that is believed, and no local map is kept.
+    back = frames[-10:]
+    assert all(by(f) == "patches" for f in back)
+    assert not back[-1].has_local_map
+    assert max(np.linalg.norm(f.error[:3]) for f in back) < 0.03
+
+
+def test_without_own_frames_it_is_lost() -> None:
+    """What the test above is about: the map alone does not do it."""
+    frames = asyncio.run(flown(np.random.default_rng(5), goes_on=False))
+    assert sum(by(f) == "" for f in frames) >= 10
+
+
+@pytest.mark.parametrize("gap_s", [0.0, 0.01])
+def test_frames_that_bring_nothing_are_not_kept(gap_s: float) -> None:
+    """Hovering; and one that is told again."""
+
+    async def scenario() -> None:
+        _, templates = chart()
+        options = WorkOptions((), demo.MAP_OPTIONS, OPTIONS, ("akaze",), InterMavOptions(), True)
+        work = MapWork(Workshop(SENSOR, options), forks=False)
+        odometry = Odometry(SENSOR, DRONE, work)
+        truth = truth_at(0.0)
+        image = photograph(truth, np.random.default_rng(1))
+        prior_covariance = np.diag(np.repeat([0.01, 0.001], 3) ** 2)
+        fix = follow(
+            image, PINHOLE, MOUNTING, templates, Prior(truth, prior_covariance), None, OPTIONS
+        )
+        assert isinstance(fix, Localized)
+        for k in range(30):
+            frame = Frame(image, round(k * gap_s * 1e9), k, 0)
+            odometry.note(frame, fix, templates, (b"world", 0))
+        assert len(odometry._window.views) == 1
+        odometry.note(Frame(image, 10**12, 99, 0), fix, templates, (b"another", 0))
+        assert len(odometry._window.views) == 1
+        work.end()
+
+    run(scenario())
