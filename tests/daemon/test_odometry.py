@@ -26,6 +26,8 @@ from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized, NotLocalized, Prior
 from vcl_companion.localization.pipeline import follow, localize
 from vcl_companion.localization.pose_filter import FilterOptions
+from vcl_companion.mapping.local_map import LocalMap
+from vcl_companion.mapping.options import NoMap
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.pose_requests import InterMavOptions
 
@@ -58,11 +60,20 @@ class Flown:
         return truth_at(self.at_s).local(self.state.world_from_body)
 
 
-async def flown(rng: np.random.Generator, *, goes_on: bool) -> list[Flown]:
+class Failing(Workshop):
+    """Makes no local map."""
+
+    def local_map(self, *_: object) -> LocalMap | NoMap:
+        raise np.linalg.LinAlgError("singular")
+
+
+async def flown(
+    rng: np.random.Generator, *, goes_on: bool, shop: type[Workshop] = Workshop
+) -> list[Flown]:
     """Fly there and back; with or without going on by own frames where the map ends."""
     index, templates = chart()
     work_options = WorkOptions((), demo.MAP_OPTIONS, OPTIONS, ("akaze",), InterMavOptions(), True)
-    work = MapWork(Workshop(SENSOR, work_options), forks=False)
+    work = MapWork(shop(SENSOR, work_options), forks=False)
     odometry = Odometry(SENSOR, DRONE, work)
     making = asyncio.create_task(odometry.run())
     options = replace(OPTIONS, drone_id=DRONE)
@@ -127,6 +138,14 @@ def test_without_own_frames_it_is_lost() -> None:
     """What the test above is about: the map alone does not do it."""
     frames = asyncio.run(flown(np.random.default_rng(5), goes_on=False))
     assert sum(by(f) == "" for f in frames) >= 10
+
+
+def test_where_no_local_map_can_be_made_it_flies_on_by_the_map() -> None:
+    frames = asyncio.run(flown(np.random.default_rng(5), goes_on=True, shop=Failing))
+    assert "odometry" not in {by(f) for f in frames}
+    assert sum(by(f) == "" for f in frames) >= 10
+    assert by(frames[-1]) == "patches"
+    assert not any(f.has_local_map for f in frames)
 
 
 @pytest.mark.parametrize("gap_s", [0.0, 0.01])

@@ -16,6 +16,7 @@ import numpy as np
 
 from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.mishaps import made_or_no_map
 from vcl_companion.daemon.workshop import OwnImage
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, log_so3
@@ -140,7 +141,11 @@ class Odometry:
             for frame in keyframes
         ]
         covariance = window.covariance_of(keyframes)
-        made = await self._work.local_map(images, covariance, self._drone_id, scene)
+        made = await made_or_no_map(
+            self._work.local_map(images, covariance, self._drone_id, scene),
+            "no map can be made of our own frames",
+            "a map of our own frames failed",
+        )
         if isinstance(made, NoMap):
             _log.debug("no local map: %s", made.reason)
         elif world == self._world and all(frame in window.views for frame in keyframes):
