@@ -96,17 +96,16 @@ def test_what_is_dropped_leaves_the_others_as_they_are() -> None:
 
 
 def test_views_that_were_placed_together_err_as_that_says() -> None:
-    """They hang on "a", so what is found by the map later errs with them as it does with that."""
+    """What is found by the map later errs with them as they err by what they were off before."""
     settled = window()
-    by_a = np.vstack([0.5 * np.eye(6), np.eye(6)])
-    own = settled.covariance_of("a")
-    covariance = by_a @ own @ by_a.T + spread(5, 12)
+    by_before = np.vstack([0.5 * np.eye(6, 12, 6), np.eye(6, 12, 6)])
+    covariance = by_before @ settled.covariance_of("va") @ by_before.T + spread(5, 12)
     moved = [Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (2.0, 1.0)]
-    settled.settle("va", Placement(moved, covariance, 1, by_a))
+    settled.settle("va", Placement(moved, covariance, 1, by_before))
     assert settled.views == ["a", "v"]
     assert [pose.translation[0] for pose in settled.poses] == [1.0, 2.0]
     np.testing.assert_allclose(settled.covariance_of("va"), covariance)
     settled.add_by_map("c", found(LEVERS["c"], KEYS))
     joint = settled.covariance_of("vac")
     with_a = LEVERS["a"] @ KEYS @ LEVERS["c"].T
-    np.testing.assert_allclose(joint[:12, 12:], by_a @ with_a, atol=1e-12)
+    np.testing.assert_allclose(joint[:12, 12:], np.vstack([0.5 * with_a, with_a]), atol=1e-12)

@@ -105,8 +105,7 @@ class PoseWindow(Generic[_View]):
             ValueError: one is not in the window.
         """
         n = 6 * len(self.views)
-        held = self._rows_of(views[placement.held : placement.held + 1])
-        with_map = placement.by_held @ self._covariance[held, n:]
+        with_map = placement.by_before @ self._covariance[self._rows_of(views), n:]
         joint = np.block([[placement.covariance, with_map], [with_map.T, self._covariance[n:, n:]]])
         order = sorted(range(len(views)), key=lambda k: self.views.index(views[k]))
         of_views = (6 * np.array(order)[:, None] + np.arange(6)).ravel()

@@ -123,9 +123,9 @@ def local_map(
             observed, inverse_depths, bodies, body_from_cam, camera, scene,
             relative @ covariance @ relative.T,
         )  # fmt: skip
+        placement = held_by_one(bodies, covariance, learnt, scene)
     except ValueError as error:
         return NoMap(str(error))
-    placement = held_by_one(bodies, covariance, learnt, scene)
     bodies = placement.bodies
     depths = depths_of(observed, learnt.inverse_depths, bodies, body_from_cam, camera, learnt.scene)
     n_found, n_fit = np.isfinite(observed[:, 1:, 0]).sum(axis=1), depths.fits[:, 1:].sum(axis=1)

@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose, adjoint
-from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.rotation import Array, orthonormalized
 from vcl_companion.mapping.given_depths import NOISE_PX, SceneDepth, moved_by, projected
 
 # Farther from where it should be, px, a patch is another spot: loosely, until the views are placed.
@@ -54,13 +54,13 @@ class Placement:
         bodies: their poses.
         covariance: (6V, 6V) of these together, local.
         held: which one of them stayed where it was.
-        by_held: (6V, 6) what each is off by what that is off.
+        by_before: (6V, 6V) what each is off by what each was off before; the rest is its own.
     """
 
     bodies: list[Pose]
     covariance: Array
     held: int
-    by_held: Array
+    by_before: Array
 
 
 def relative_map(bodies: list[Pose]) -> Array:
@@ -156,6 +156,9 @@ def held_by_one(
         covariance: (6V, 6V) of them together, local.
         learnt: how they lie to the first one.
         scene: how far what they show is: by it turning and moving are compared.
+
+    Raises:
+        ValueError: the covariance is singular.
     """
     v = len(bodies)
     worth = np.repeat([scene.typical, 1.0], 3) ** 2
@@ -165,15 +168,25 @@ def held_by_one(
     steps = np.concatenate([np.zeros(6), learnt.step]).reshape(v, 6)
     lying = [body.retracted(step) for body, step in zip(bodies, steps, strict=True)]
     moved = bodies[held] @ lying[held].inverse()
-    poses = [moved @ body for body in lying]
+    # From map to map poses are made of poses: what rounding leaves would grow each time.
+    poses = [
+        Pose(orthonormalized(pose.rotation), pose.translation)
+        for pose in (moved @ body for body in lying)
+    ]
     # What each is off: as the first one is, and by how it lies to that; the first as the held is.
     by_first = np.vstack([adjoint(body.inverse() @ poses[0]) for body in poses])
     by_lying = np.vstack([np.zeros((6, 6 * v - 6)), np.eye(6 * v - 6)])
     to_held = adjoint(poses[0].inverse() @ poses[held])
     by_lying = by_lying - by_first @ to_held @ by_lying[own]
-    by_held = by_first @ to_held
-    after = by_held @ covariance[own, own] @ by_held.T + by_lying @ learnt.covariance @ by_lying.T
-    return Placement(poses, 0.5 * (after + after.T), held, by_held)
+    # What is not learnt of how they lie to each other, as a scale is not, is off as it was before,
+    # and with what else that has to do with.
+    relative = relative_map(bodies)
+    stays = learnt.covariance @ _inverse(relative @ covariance @ relative.T)
+    by_before = by_lying @ stays @ relative
+    by_before[:, own] += by_first @ to_held
+    own_noise = learnt.covariance - stays @ learnt.covariance
+    after = by_before @ covariance @ by_before.T + by_lying @ own_noise @ by_lying.T
+    return Placement(poses, 0.5 * (after + after.T), held, by_before)
 
 
 def _inverse(covariance: Array) -> Array:
