@@ -148,6 +148,36 @@ def test_where_no_local_map_can_be_made_it_flies_on_by_the_map() -> None:
     assert not any(f.has_local_map for f in frames)
 
 
+def test_a_new_map_that_shows_little_of_the_place_ends_no_odometry() -> None:
+    async def scenario() -> None:
+        _, templates = chart()
+        options = WorkOptions((), demo.MAP_OPTIONS, OPTIONS, ("akaze",), InterMavOptions(), True)
+        work = MapWork(Workshop(SENSOR, options), forks=False)
+        odometry = Odometry(SENSOR, DRONE, work)
+        making = asyncio.create_task(odometry.run())
+        small = np.diag(np.repeat([0.01, 0.001], 3) ** 2)
+        another = templates.uncertainty.keyframe_covariance.copy()
+        for k, (covered, is_kept) in enumerate(
+            [(0.8, False), (0.6, False), (0.5, True), (0.5, True), (0.2, True), (0.75, False)]
+        ):
+            truth = truth_at(1.5 + 0.3 * k)
+            image = photograph(truth, np.random.default_rng(k))
+            where = Prior(truth, small)
+            fix = follow(image, PINHOLE, MOUNTING, templates, where, None, OPTIONS)
+            assert isinstance(fix, Localized)
+            keyframes = another if k >= 4 else fix.keyframe_covariance
+            told = replace(fix, covered=covered, keyframe_covariance=keyframes)
+            odometry.note(Frame(image, k * 10**8, k, 0), told, templates, (b"world", 0))
+            await odometry.settled()
+            assert (odometry.templates is not None) == is_kept, k
+        making.cancel()
+        with suppress(asyncio.CancelledError):
+            await making
+        work.end()
+
+    run(scenario())
+
+
 @pytest.mark.parametrize("gap_s", [0.0, 0.01])
 def test_frames_that_bring_nothing_are_not_kept(gap_s: float) -> None:
     """Hovering; and one that is told again."""

@@ -110,7 +110,8 @@ class Odometry:
         if not self._add(frame, fix, seen):
             return
         by, most = self._most_covered
-        most = max(fix.covered, most if by is fix.keyframe_covariance else 0.0)
+        # What one map has filled another one may, or nearly: sky it would not be.
+        most = max(fix.covered, most if by is fix.keyframe_covariance else _OF_MOST * most)
         self._most_covered = fix.keyframe_covariance, most
         if fix.covered < min(_COVERED, _OF_MOST * most):
             self._idle.clear()
