@@ -15,7 +15,7 @@ from vcl_companion.geometry.rotation import Array, about_down, exp_so3
 from vcl_companion.localization.fix import Localized, NotLocalized, Prior, Recognised
 from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.map_index import index_map
-from vcl_companion.localization.pipeline import Effort, PipelineOptions, localize
+from vcl_companion.localization.pipeline import Effort, PipelineOptions, follow, localize
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.vision.features import Image
 
@@ -156,6 +156,15 @@ def test_an_autopilot_without_a_north_contradicts_no_heading(expected: Prior | N
     refused = seen(tilted, False)
     assert isinstance(refused, NotLocalized)
     assert "roll and pitch" in refused.reason
+    # Who goes on by own frames asks for patches alone, by the same rule.
+    by_patches = [
+        follow(
+            shot.image, sensor.camera, sensor.body_from_cam, demo.templates(1, 2, 3), prior(),
+            turned, OPTIONS.by_heading(has_heading),
+        )
+        for has_heading in (True, False)
+    ]  # fmt: skip
+    assert [isinstance(fix, Localized) for fix in by_patches] == [False, True]
 
 
 def test_the_paper_s_pipeline_finds_features_only() -> None:

@@ -135,7 +135,7 @@ class OwnFixes:
             local,
             predicted.prior(),
             ned_from_body,
-            self._options,
+            self._options.by_heading(self._estimator.has_heading),
         )
         if isinstance(own, NotLocalized) or not self._odometry.tells_more(own, on_map.fix):
             return None

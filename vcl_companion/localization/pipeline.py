@@ -49,6 +49,12 @@ class PipelineOptions:
     tracking: TrackingOptions
     drone_id: int | None = None
 
+    def by_heading(self, has_heading: bool) -> PipelineOptions:
+        """Return the same where the autopilot's heading is its own; else of any heading."""
+        if has_heading:
+            return self
+        return replace(self, localization=self.localization.of_any_heading())
+
 
 @dataclass(frozen=True, kw_only=True)
 class Effort:
@@ -106,8 +112,7 @@ def localize(
         The pose with its covariance in parts, or why there is none: what the
         features said, for they were asked last.
     """
-    if not effort.has_heading:
-        options = replace(options, localization=options.localization.of_any_heading())
+    options = options.by_heading(effort.has_heading)
     tracked: Localized | NotLocalized | None = None
     if templates is not None and prior is not None and effort.may_track:
         tracked = follow(image, camera, body_from_cam, templates, prior, ned_from_body, options)
