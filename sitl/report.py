@@ -15,8 +15,8 @@ Terms beyond ``sitl.evaluation``'s:
   the frames' own fixes, of the peers' proposals, and of what was sent; how many
   ``proposals`` came and how many of them were ``proposals_fused``.
 * ``relies_on``: share of the frames whose sent pose relies on the map by ``patches`` or by
-  ``features``, on a ``peer`` alone, on attitude and ``motion`` alone, or where ``nothing``
-  was sent.
+  ``features``, on the drone's own last frames where the map ends (``odometry``), on a ``peer``
+  alone, on attitude and ``motion`` alone, or where ``nothing`` was sent.
 * ``between``: poses between frames that the autopilot received (``[autopilot] min_rate_hz``):
   how many, and their ``ate_m``, the truth interpolated; no other number here is of them.
 * ``fused``: what a real autopilot made of our poses (``sitl.fused``); null for a stand-in.

@@ -70,6 +70,7 @@ class Flight:
         coasted: (drone, frame) refused, and sent by attitude and motion alone.
         network: what the relay between the drones counted, if it did.
         features: (drone, frame) whose own fix rests on features, not on patches.
+        odometry: (drone, frame) whose own fix rests on the drone's own last frames.
         partitions: in which some did not hear others.
         reset: (drone, frame) from which on the autopilot is told of a reset.
         error: (drone, frame) to the (6,) error of its pose, as MAVLink puts it.
@@ -88,6 +89,7 @@ class Flight:
     between: Mapping[tuple[str, int], float] = field(default_factory=dict)
     coasted: frozenset[tuple[str, int]] = frozenset()
     features: frozenset[tuple[str, int]] = frozenset()
+    odometry: frozenset[tuple[str, int]] = frozenset()
     network: NetworkLog | None = None
     partitions: tuple[Partition, ...] = ()
     reset: tuple[str, int] | None = None
@@ -174,6 +176,7 @@ def _log(name: str, n: int, flight: Flight, revision: str, n_bytes: int) -> list
             source = "intra" if (name, k) not in flight.proposed else "fused"
             source = "inter" if (name, k) in flight.starved else source
         by: str | None = "features" if (name, k) in flight.features else "patches"
+        by = "odometry" if (name, k) in flight.odometry else by
         by = "peer" if source == "inter" else by
         if (name, k) in flight.held_back:
             by, reason = None, "held back: more than 30 poses a second"

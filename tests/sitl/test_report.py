@@ -250,6 +250,7 @@ def test_the_report_tells_what_every_pose_relies_on(tmp_path: Path) -> None:
     flight = Flight(
         n_frames=10,
         features=frozenset({("mav1", 0)}),
+        odometry=frozenset({("mav1", 3)}),
         proposed={("mav1", 2): 0.1, ("mav1", 4): 0.1},
         starved=frozenset({("mav1", 4)}),
         coasted=frozenset({("mav1", 5), ("mav1", 6)}),
@@ -259,7 +260,8 @@ def test_the_report_tells_what_every_pose_relies_on(tmp_path: Path) -> None:
     result, report, out = reported(tmp_path, flight)
     drone = report["drones"]["mav1"]
     assert drone["relies_on"] == {
-        "patches": 0.4, "features": 0.1, "peer": 0.1, "motion": 0.2, "nothing": 0.2,
+        "patches": 0.3, "features": 0.1, "odometry": 0.1, "peer": 0.1, "motion": 0.2,
+        "nothing": 0.2,
     }  # fmt: skip
     # What nobody measured is not localized, though it was sent.
     assert (drone["localized_share"], drone["frames_refused"]) == (pytest.approx(0.6), 3)
@@ -282,7 +284,10 @@ def test_a_log_of_before_patches_says_what_it_knew(tmp_path: Path) -> None:
     for path in (out / "run").glob("*/flight.jsonl"):
         path.write_text(re.sub(r', "by": ("\w+"|null)', "", path.read_text()))
     said = report_of(gather(plan, out))["drones"]["mav1"]["relies_on"]
-    assert said == {"patches": 0.0, "features": 0.5, "peer": 0.25, "motion": 0.0, "nothing": 0.25}
+    assert said == {
+        "patches": 0.0, "features": 0.5, "odometry": 0.0, "peer": 0.25, "motion": 0.0,
+        "nothing": 0.25,
+    }  # fmt: skip
 
 
 def test_a_coasted_pose_that_was_not_received_is_said_aloud(tmp_path: Path) -> None:
