@@ -91,8 +91,7 @@ class Odometry:
         """Whether what the local map says of a frame is to be believed, and not the swarm's."""
         if isinstance(on_map, NotLocalized) or self._scene is None:
             return True
-        worth = np.repeat([self._scene.typical, 1.0], 3) ** 2
-        vague, vague_on_map = (worth @ np.diag(fix.covariance()) for fix in (own, on_map))
+        vague, vague_on_map = (self._scene.vagueness(fix.covariance())[0] for fix in (own, on_map))
         return bool(vague < _CLEARLY_SURER**2 * vague_on_map)
 
     def note(self, frame: Frame, fix: Localized, seen: Templates, world: tuple[bytes, int]) -> None:

@@ -52,8 +52,6 @@ _N_NEW_IMAGES = 16
 _MOST_SEEN = 1000
 # Less of a map would not tell where one is.
 _LEAST_KEYFRAMES, _LEAST_LANDMARKS = 2, 100
-
-
 # Of our own frames, which are a moment apart: quickly found, and enough in each part of the image.
 _OWN_FEATURES = FeatureOptions(max_features=600)
 
@@ -186,22 +184,19 @@ class Workshop:
             drone_id: ours.
             scene: how far what the newest one shows may be.
         """
-        camera = self._sensor.camera
-        known = {view.captured_at_ns: self._own_features.get(view.captured_at_ns) for view in views}
-        self._own_features = {
-            view.captured_at_ns: known[view.captured_at_ns]
-            or shown(detect(view.image, "orb", _OWN_FEATURES), camera)
-            for view in views
-        }
+        camera, known = self._sensor.camera, self._own_features
         own = [
             OwnView(
                 view.captured_at_ns,
                 pyramid_of(view.image),
-                self._own_features[view.captured_at_ns],
+                known.get(view.captured_at_ns)
+                or shown(detect(view.image, "orb", _OWN_FEATURES), camera),
                 view.world_from_body,
             )
             for view in views
         ]
+        # One map and the next are mostly of the same frames.
+        self._own_features = {view.captured_at_ns: view.features for view in own}
         return local_map(own, covariance, camera, self._sensor.body_from_cam, drone_id, scene)
 
     def look_at(self, frame: FrameAnswer) -> None:

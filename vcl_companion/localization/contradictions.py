@@ -21,6 +21,7 @@ from vcl_companion.localization.filter_state import (
     VELOCITY,
     FilterState,
     Measurement,
+    unknown,
 )
 from vcl_companion.localization.fix import Localized, NotLocalized
 
@@ -85,13 +86,12 @@ def _doubting_attitude(state: FilterState, turned_rad: float) -> FilterState:
 
 def _forgotten(state: FilterState) -> FilterState:
     """Return the state that knows nothing of where it is; with an autopilot, how it is turned."""
-    covariance = state.covariance.copy()
     forgotten = [(POSITION, _FORGOTTEN_M), (VELOCITY, _FORGOTTEN_M_S)]
     if state.ned_from_body is None:
         forgotten.append((OFFSET, _FORGOTTEN_RAD))
-    for part, sigma in forgotten:
-        covariance[part] = covariance[:, part] = 0.0
-        covariance[part, part] = np.eye(3) * sigma**2
     return replace(
-        state, covariance=covariance, velocity_world=np.zeros(3), n_jumps=state.n_jumps + 1
+        state,
+        covariance=unknown(state.covariance, forgotten),
+        velocity_world=np.zeros(3),
+        n_jumps=state.n_jumps + 1,
     )

@@ -14,6 +14,7 @@ of a map of own views there is one more.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +32,20 @@ N_OWN = 12
 
 GATE_POSE = 27.9
 """99.99 % of chi^2 with 6 degrees of freedom: beyond, it is not noise."""
+
+
+def unknown(covariance: Array, sigmas: Sequence[tuple[slice, float]]) -> Array:
+    """Return an error state's covariance where nothing is known of some parts of three numbers.
+
+    Args:
+        covariance: (12 + K, 12 + K) of the error state.
+        sigmas: each part, and how far it may be off then, 1 sigma.
+    """
+    out = covariance.copy()
+    for part, sigma in sigmas:
+        out[part] = out[:, part] = 0.0
+        out[part, part] = np.eye(3) * sigma**2
+    return out
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,7 @@ from vcl_companion.localization.filter_state import (
     FilterState,
     Measurement,
     kalman_step,
+    unknown,
 )
 from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.options import require_positive
@@ -247,9 +248,7 @@ def _on_own_views(state: FilterState, fix: Localized, measured: Measurement) -> 
     )
     expected, innovation = measured.expected_by(covariance), measured.innovation
     if innovation @ np.linalg.solve(expected, innovation) > GATE_POSE:
-        for part, sigma in ((POSITION, _ANYWHERE_M), (OFFSET, np.pi)):
-            covariance[part] = covariance[:, part] = 0.0
-            covariance[part, part] = np.eye(3) * sigma**2
+        covariance = unknown(covariance, ((POSITION, _ANYWHERE_M), (OFFSET, np.pi)))
     return replace(state, covariance=covariance)
 
 

@@ -46,6 +46,15 @@ class SceneDepth:
         """Return (N,) inverse depths, 1/m, none of them far beyond the scene's."""
         return np.clip(inverse_depths, self.least / _BEYOND, self.largest * _BEYOND)
 
+    def vagueness(self, covariance: Array) -> Array:
+        """Return (V,) how vague poses are, rad^2: moving counts by how far the scene is.
+
+        Args:
+            covariance: (6V, 6V) of V poses, local.
+        """
+        worth = np.repeat([self.typical, 1.0], 3) ** 2
+        return np.asarray(np.diag(covariance).reshape(-1, 6) @ worth)
+
 
 @dataclass(frozen=True, eq=False)
 class Depths:

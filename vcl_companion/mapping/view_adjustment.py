@@ -16,6 +16,7 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose, adjoint
 from vcl_companion.geometry.rotation import Array, orthonormalized
 from vcl_companion.mapping.given_depths import NOISE_PX, SceneDepth, moved_by, projected
+from vcl_companion.vision.information import covariance_of
 
 # Farther from where it should be, px, a patch is another spot: loosely, until the views are placed.
 _LIMITS_PX = (8.0, 4.0, 2.0, 1.5, 1.5)
@@ -27,6 +28,8 @@ _ALIKE, _TOLD_ALIKE = 9.0, 100.0
 # Depths are taken to lie so many times as far apart as they do: of some hundred that no parallax
 # tells, each near the scene's, all together would seem to tell how far the views are apart.
 _WIDER = 10.0
+# Smallest eigenvalue of a matrix with ones on its diagonal; less is rounding.
+_SINGULAR = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,9 +164,7 @@ def held_by_one(
         ValueError: the covariance is singular.
     """
     v = len(bodies)
-    worth = np.repeat([scene.typical, 1.0], 3) ** 2
-    vague = (np.diag(covariance).reshape(v, 6) * worth).sum(axis=1)
-    held = int(np.argmin(vague))
+    held = int(np.argmin(scene.vagueness(covariance)))
     own = slice(6 * held, 6 * held + 6)
     steps = np.concatenate([np.zeros(6), learnt.step]).reshape(v, 6)
     lying = [body.retracted(step) for body, step in zip(bodies, steps, strict=True)]
@@ -190,10 +191,7 @@ def held_by_one(
 
 
 def _inverse(covariance: Array) -> Array:
-    try:
-        inverse = np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)))
-    except np.linalg.LinAlgError:
-        inverse = np.full_like(covariance, np.nan)
-    if not np.all(np.isfinite(inverse)):
+    inverse = covariance_of(0.5 * (covariance + covariance.T), _SINGULAR)
+    if inverse is None:
         raise ValueError("what views are off to each other is no covariance")
     return inverse
