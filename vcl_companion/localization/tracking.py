@@ -333,18 +333,20 @@ class _Tracker:
     def _by_lens(
         self, found: Alignment, inverse: Array, j_poses: Array, roots: Array, weights: Array
     ) -> Array:
-        """Return the pose's (6, 6) covariance by what the lens may be off.
+        """Return the pose's (6, 6) covariance by what the lens, and all patches alike, may be off.
 
-        Of landmarks that the same drone's keyframes fixed it is off alike there: what counts is
-        the difference.
+        Of landmarks that the same drone's keyframes fixed the lens is off alike there: what counts
+        is the difference.
         """
-        calibration_px = self._templates.uncertainty.calibration_px
-        if not calibration_px:
+        uncertainty = self._templates.uncertainty
+        if not (uncertainty.calibration_px or uncertainty.alike_px):
             return np.zeros((6, 6))
-        off_px = lens_px(self._camera, found.pixels, calibration_px)
+        by_lens = lens_px(self._camera, found.pixels, uncertainty.calibration_px)
         own = self._is_ours(found)
         then = self._anchors.pixels[found.anchors[own]]
-        off_px[own] -= lens_px(self._camera, then, calibration_px)
+        by_lens[own] -= lens_px(self._camera, then, uncertainty.calibration_px)
+        alike = lens_px(self._camera, found.pixels, uncertainty.alike_px)
+        off_px = np.concatenate([by_lens, alike], axis=2)
         # In units of the residuals' sigmas, as ``j_poses``.
         first = off_px[:, 0] / roots[0][:, None]
         second = (off_px[:, 1] - roots[1][:, None] * first) / roots[2][:, None]

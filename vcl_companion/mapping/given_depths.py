@@ -2,8 +2,9 @@
 
 The poses are not adjusted: whatever they are off by, depths are off by with them. How, is told
 besides (the levers), so that who rests on such landmarks knows what all have in common. Where
-views are too close together to tell, a depth stays about what the scene's is; that they all may
-be wrong together is told as well.
+views are too close together to tell, a depth stays about what the scene's is there. What lies
+side by side is about as far away, and so wrong together: that is told as well. As if each
+depth were wrong by itself, hundreds would seem to tell turning and moving apart that do not.
 """
 
 from __future__ import annotations
@@ -17,12 +18,20 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose, adjoint
 from vcl_companion.geometry.rotation import Array
 
-NOISE_PX = 0.1
+NOISE_PX = 0.2
 """What a patch that was found is off, 1 sigma."""
 # Farther from where the depth puts it, px, a patch is another spot: loosely, until it is settled.
 _LIMITS_PX = (2.0, 1.5)
 # How far a depth may come to lie beyond the scene's, times.
 _BEYOND = 2.0
+MOST_AT_ONCE = 0.7
+"""No depth changes by more in one step of an adjustment, logarithm."""
+# Parts of an image across and down: corners of a grid over it.
+_PARTS = (4, 3)
+# A patch lies so far before or behind what is about it, logarithm of distances, 1 sigma. Taken for
+# much more than it is, what noise does to depths that hardly any parallax tells would pass for
+# relief, and who moves over relief that is not there seems not to move.
+_RELIEF = 0.4
 
 
 @dataclass(frozen=True)
@@ -32,8 +41,8 @@ class SceneDepth:
     Attributes:
         least, largest: none lies beyond.
         typical: the median.
-        spread: 1 sigma about it.
-        off: 1 sigma of what that is off, the same for all.
+        spread: 1 sigma of a part of the image about it, logarithm: the same at any scale.
+        off: 1 sigma of what that is off, the same for all, logarithm.
     """
 
     least: float
@@ -46,6 +55,18 @@ class SceneDepth:
         """Return (N,) inverse depths, 1/m, none of them far beyond the scene's."""
         return np.clip(inverse_depths, self.least / _BEYOND, self.largest * _BEYOND)
 
+    def parts(self, pixels: Array, camera: Camera) -> DepthParts:
+        """Return what is known beforehand of the parts of a view that show (N, 2) pixels."""
+        size_px = camera.width_px, camera.height_px
+        across, down = (
+            np.maximum(1.0 - np.abs(at[:, None] * ((n - 1) / size) - np.arange(n)), 0.0)
+            for at, size, n in zip(pixels.T, size_px, _PARTS, strict=True)
+        )
+        k = _PARTS[0] * _PARTS[1]
+        shares = (across[:, :, None] * down[:, None, :]).reshape(len(pixels), k)
+        covariance = np.full((k, k), self.off**2) + np.eye(k) * self.spread**2
+        return DepthParts(shares, np.full(k, np.log(self.typical)), covariance, _RELIEF)
+
     def vagueness(self, covariance: Array) -> Array:
         """Return (V,) how vague poses are, rad^2: moving counts by how far the scene is.
 
@@ -57,6 +78,27 @@ class SceneDepth:
 
 
 @dataclass(frozen=True, eq=False)
+class DepthParts:
+    """How far what a view shows is, by K parts of it; each goes over into those beside it.
+
+    Attributes:
+        shares: (N, K) of the parts in where N patches are; they sum to 1.
+        typical: (K,) of the parts, logarithms of 1/m.
+        covariance: (K, K) of these.
+        relief: 1 sigma of a patch about what its parts say, logarithm.
+    """
+
+    shares: Array
+    typical: Array
+    covariance: Array
+    relief: float
+
+    def expected(self) -> Array:
+        """Return (N,) logarithms of the patches' inverse depths, 1/m."""
+        return np.asarray(self.shares @ self.typical)
+
+
+@dataclass(frozen=True, eq=False)
 class Depths:
     """The depths of N patches of view 0 of V.
 
@@ -64,16 +106,14 @@ class Depths:
         points: (N, 3) world, m.
         covariance: (N, 3, 3) of each were the poses exact, m^2.
         lever: (N, 3, 6V) a point's error per error of the bodies' poses, local perturbations.
-        by_scene: (N, 3) how far it moves if the typical inverse depth is 1 sigma larger, m.
-        relative_sigma: (N,) of each distance were the poses exact.
+        by_parts: (N, 3, K) how far it moves by K errors of the scene's parts, 1 sigma each, m.
         fits: (N, V) where the patch was found and lies as its depth says.
     """
 
     points: Array
     covariance: Array
     lever: Array
-    by_scene: Array
-    relative_sigma: Array
+    by_parts: Array
     fits: NDArray[np.bool_]
 
 
@@ -101,6 +141,7 @@ def depths_of(
     body_from_cam: Pose,
     camera: Camera,
     scene: SceneDepth,
+    parts: DepthParts,
 ) -> Depths:
     """Find the depths that agree best with where other views show the patches.
 
@@ -110,36 +151,40 @@ def depths_of(
         bodies: V poses.
         body_from_cam: the camera's mounting, the same in all.
         camera: its intrinsics.
-        scene: where depths are expected.
+        scene: within which depths lie.
+        parts: of view 0, where the patches are: about where depths are expected.
     """
     cams = [body @ body_from_cam for body in bodies]
     ideal = camera.ideal_from_pixels(observed_px[:, 0])
     rays = np.column_stack([ideal, np.ones(len(ideal))])
     r, weight = inverse_depths, 1.0 / NOISE_PX**2
-    certain = 1.0 / scene.spread**2
+    certain, expected = 1.0 / parts.relief**2, parts.expected()
     fits = np.zeros(observed_px.shape[:2], dtype=bool)
     fits[:, 0] = True
     for limit_px in _LIMITS_PX:
         r = scene.within(r)
+        off = expected - np.log(r)
         shown = [projected(rays, r, cams[0], cam, camera) for cam in cams[1:]]
-        information, pull = np.full(len(r), certain), certain * (scene.typical - r)
+        information, pull = np.full(len(r), certain), certain * off
         for i, there in enumerate(shown, start=1):
-            off = observed_px[:, i] - there.pixels
+            missed = observed_px[:, i] - there.pixels
             with np.errstate(invalid="ignore"):
-                fits[:, i] = np.linalg.norm(off, axis=1) < limit_px
-            slope = np.where(fits[:, [i]], there.by_inverse_depth, 0.0)
+                fits[:, i] = np.linalg.norm(missed, axis=1) < limit_px
+            slope = np.where(fits[:, [i]], there.by_inverse_depth * r[:, None], 0.0)
             information += weight * (slope**2).sum(axis=1)
-            pull += weight * (slope * np.where(fits[:, [i]], off, 0.0)).sum(axis=1)
-        r = r + pull / information
+            pull += weight * (slope * np.where(fits[:, [i]], missed, 0.0)).sum(axis=1)
+        r = r * np.exp(np.clip(pull / information, -MOST_AT_ONCE, MOST_AT_ONCE))
     # The last step is the smallest; what it was taken from is as good for the errors.
     lever = _lever(
-        rays, r, shown, fits, weight / information, cams, adjoint(body_from_cam.inverse())
+        rays, r, shown, fits, weight * r**2 / information, cams, adjoint(body_from_cam.inverse())
     )
-    sigma, moved = 1.0 / np.sqrt(information), _by_inverse_depth(rays, r, cams[0])
-    covariance = np.einsum("ni,nj->nij", moved, moved) * (sigma**2)[:, None, None]
+    # What the depths' logarithms move.
+    moved = r[:, None] * _by_inverse_depth(rays, r, cams[0])
+    covariance = np.einsum("ni,nj->nij", moved, moved) / information[:, None, None]
     points = cams[0].apply(rays / r[:, None])
-    by_scene = moved * (certain * scene.off / information)[:, None]
-    return Depths(points, covariance, lever, by_scene, sigma / r, fits)
+    by_part = (certain / information)[:, None] * parts.shares @ np.linalg.cholesky(parts.covariance)
+    by_parts = moved[:, :, None] * by_part[:, None, :]
+    return Depths(points, covariance, lever, by_parts, fits)
 
 
 def projected(rays: Array, r: Array, a: Pose, b: Pose, camera: Camera) -> Projected:

@@ -35,6 +35,8 @@ from vcl_companion.vision.patches import AlignRules, Pyramid
 _LEAST_LANDMARKS = 30
 # Where fewer of the patches agree, they agree on a wrong way of lying to each other.
 _LEAST_SHARE = 0.5
+# Patches of views that lie close together are off alike: of the motion between them it is much.
+_ALIKE_PX = 0.05
 # Where all depths that a scene may have lie within so much, one look finds a patch.
 _SHORT_PX, _REACH_PX = 6.0, 4.0
 _RULES = AlignRules(max_iterations=15, least_score=0.85, max_moved_px=3.0, settled_px=0.02)
@@ -64,7 +66,8 @@ class LocalMap:
 
     Attributes:
         templates: the map, ready to be tracked; its keyframes are the views, the newest first. What
-            it takes to be off has one more part after theirs: how far the scene is.
+            it takes to be off has more after theirs: how far the parts of the newest one's scene
+            are.
         placement: where these are.
     """
 
@@ -84,8 +87,8 @@ def scene_depth(world_from_cam: Pose, camera: Camera, points: Array) -> SceneDep
         return None
     least, largest = depth_range(Pose.identity(), shown)
     low, typical, high = (float(q) for q in np.quantile(1.0 / shown[:, 2], [0.05, 0.5, 0.95]))
-    # What comes into view may be anywhere: as near again.
-    spread = max(typical, 0.5 * (high - low))
+    # What comes into view may be anywhere: half as far, or twice.
+    spread = max(float(np.log(2.0)), 0.5 * float(np.log(high / low)))
     return SceneDepth(least, largest, typical, spread, spread)
 
 
@@ -118,16 +121,19 @@ def local_map(
     if len(observed) < _LEAST_LANDMARKS:
         return NoMap(f"our own frames show {len(observed)} patches alike")
     relative = relative_map(bodies)
+    parts = scene.parts(observed[:, 0], camera)
     try:
         learnt = adjusted(
-            observed, inverse_depths, bodies, body_from_cam, camera, scene,
+            observed, inverse_depths, bodies, body_from_cam, camera, scene, parts,
             relative @ covariance @ relative.T,
         )  # fmt: skip
         placement = held_by_one(bodies, covariance, learnt, scene)
     except ValueError as error:
         return NoMap(str(error))
     bodies = placement.bodies
-    depths = depths_of(observed, learnt.inverse_depths, bodies, body_from_cam, camera, learnt.scene)
+    depths = depths_of(
+        observed, learnt.inverse_depths, bodies, body_from_cam, camera, scene, learnt.parts
+    )
     n_found, n_fit = np.isfinite(observed[:, 1:, 0]).sum(axis=1), depths.fits[:, 1:].sum(axis=1)
     good = (n_fit >= 1) & (2 * n_fit >= n_found)
     if np.count_nonzero(good) < max(_LEAST_LANDMARKS, _LEAST_SHARE * len(good)):
@@ -140,12 +146,13 @@ def local_map(
     )
     observed = np.where(depths.fits[:, :, None], observed, np.nan)[good]
     landmark_map = LandmarkMap(keyframes, depths.points[good], observed, NOISE_PX, (), (), b"")
-    # What the scene is off as a whole is one more error that all share.
-    lever = np.concatenate([depths.lever, depths.by_scene[:, :, None]], axis=2)
+    # What the scene's parts are off are further errors that landmarks share.
+    lever = np.concatenate([depths.lever, depths.by_parts], axis=2)
     uncertainty = MapUncertainty(
-        block_diag(placement.covariance, np.eye(1)),
+        block_diag(placement.covariance, np.eye(depths.by_parts.shape[2])),
         depths.covariance[good],
         np.ascontiguousarray(lever[good], dtype=np.float32),
+        alike_px=_ALIKE_PX,
     )
     templates = prepare_templates(landmark_map, uncertainty, lambda name, _: pyramids[name])
     return LocalMap(templates, placement)

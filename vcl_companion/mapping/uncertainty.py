@@ -56,12 +56,15 @@ class MapUncertainty:
         landmark_covariance: (N, 3, 3) of each landmark were the keyframes exact, m^2.
         landmark_lever: (N, 3, 6V) landmark error per keyframe error.
         calibration_px: what lenses were taken to be off (``lens_errors``); 0 for exact ones.
+        alike_px: what the patches of a frame are off together, anew in each, smoothly over the
+            image as a lens is.
     """
 
     keyframe_covariance: Array
     landmark_covariance: Array
     landmark_lever: NDArray[np.float32]
     calibration_px: float = 0.0
+    alike_px: float = 0.0
 
     def marginal(self) -> Array:
         """Return (N, 3, 3) the whole covariance of each landmark, m^2."""

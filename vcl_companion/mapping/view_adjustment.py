@@ -15,7 +15,14 @@ from scipy.linalg import block_diag
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose, adjoint
 from vcl_companion.geometry.rotation import Array, orthonormalized
-from vcl_companion.mapping.given_depths import NOISE_PX, SceneDepth, moved_by, projected
+from vcl_companion.mapping.given_depths import (
+    MOST_AT_ONCE,
+    NOISE_PX,
+    DepthParts,
+    SceneDepth,
+    moved_by,
+    projected,
+)
 from vcl_companion.vision.information import covariance_of
 
 # Farther from where it should be, px, a patch is another spot: loosely, until the views are placed.
@@ -25,9 +32,6 @@ _CAUCHY_PX = 0.5
 # Patches err alike, through the lens, the light, the encoder: as so many count for one. Of what is
 # found by them less is believed than is made of them.
 _ALIKE, _TOLD_ALIKE = 9.0, 100.0
-# Depths are taken to lie so many times as far apart as they do: of some hundred that no parallax
-# tells, each near the scene's, all together would seem to tell how far the views are apart.
-_WIDER = 10.0
 # Smallest eigenvalue of a matrix with ones on its diagonal; less is rounding.
 _SINGULAR = 1e-14
 
@@ -40,13 +44,13 @@ class Relative:
         inverse_depths: (N,) of the patches in the first view, 1/m.
         step: (6 (V - 1),) by which they lie otherwise than believed, local perturbations.
         covariance: (6 (V - 1), 6 (V - 1)) of what they are off to the first view now.
-        scene: how far it is.
+        parts: how far the first one's scene is, as far as that is known now.
     """
 
     inverse_depths: Array
     step: Array
     covariance: Array
-    scene: SceneDepth
+    parts: DepthParts
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +86,7 @@ def adjusted(
     body_from_cam: Pose,
     camera: Camera,
     scene: SceneDepth,
+    parts: DepthParts,
     covariance: Array,
 ) -> Relative:
     """Find how views lie to the first one, and the depths, that patches agree with best.
@@ -92,7 +97,8 @@ def adjusted(
         bodies: V poses, as they are believed to be.
         body_from_cam: the camera's mounting, the same in all.
         camera: its intrinsics.
-        scene: where depths are expected.
+        scene: within which depths lie.
+        parts: of view 0, where the patches are: about where depths are expected.
         covariance: (6 (V - 1), 6 (V - 1)) of what the others are off to the first one.
 
     Raises:
@@ -102,17 +108,19 @@ def adjusted(
     ideal = camera.ideal_from_pixels(observed_px[:, 0])
     rays = np.column_stack([ideal, np.ones(n)])
     cam_from_body = adjoint(body_from_cam.inverse())
-    # The poses, and what the scene's typical inverse depth is off.
-    n_poses, certain = 6 * (v - 1), (_WIDER * scene.spread) ** -2
-    believed = block_diag(_inverse(covariance), np.array([[scene.off**-2]]))
-    r, step = scene.within(inverse_depths), np.zeros(n_poses + 1)
+    # The poses, and what the parts' inverse depths are off.
+    shares, certain = parts.shares, 1.0 / parts.relief**2
+    believed = block_diag(_inverse(covariance), _inverse(parts.covariance))
+    r, step = scene.within(inverse_depths), np.zeros(len(believed))
+    of_parts = slice(6 * (v - 1), None)
     for limit_px in _LIMITS_PX:
-        off_scene = scene.typical + step[-1] - r
+        off_scene = parts.expected() + shares @ step[of_parts] - np.log(r)
         r_information, r_pull = np.full(n, certain), certain * off_scene
-        seen, pull = np.zeros_like(believed), np.zeros(n_poses + 1)
-        seen[-1, -1], pull[-1] = n * certain, -certain * off_scene.sum()
-        crossed = np.zeros((n, n_poses + 1))
-        crossed[:, -1] = -certain
+        seen, pull = np.zeros_like(believed), np.zeros(len(believed))
+        seen[of_parts, of_parts] = certain * shares.T @ shares
+        pull[of_parts] = -certain * off_scene @ shares
+        crossed = np.zeros((n, len(believed)))
+        crossed[:, of_parts] = -certain * shares
         for i in range(1, v):
             own = slice(6 * i - 6, 6 * i)
             body = bodies[i].retracted(step[own])
@@ -123,7 +131,7 @@ def adjusted(
                 fits = squared < limit_px**2
             weight = np.where(fits, NOISE_PX**-2 / (1.0 + squared / _CAUCHY_PX**2), 0.0)
             off = np.where(fits[:, None], off, 0.0)
-            by_depth = np.where(fits[:, None], there.by_inverse_depth, 0.0)
+            by_depth = np.where(fits[:, None], there.by_inverse_depth * r[:, None], 0.0)
             by_pose = np.where(
                 fits[:, None, None],
                 -there.by_point @ moved_by(there.points_cam) @ cam_from_body,
@@ -139,11 +147,16 @@ def adjusted(
         pull -= crossed.T @ (r_pull / r_information)
         taken = np.linalg.solve(believed + seen / _ALIKE, pull / _ALIKE - believed @ step)
         step = step + taken
-        r = scene.within(r + (r_pull - crossed @ taken) / r_information)
+        nearer = np.clip((r_pull - crossed @ taken) / r_information, -MOST_AT_ONCE, MOST_AT_ONCE)
+        r = scene.within(r * np.exp(nearer))
     left = _inverse(believed + seen / _TOLD_ALIKE)
-    typical = scene.within(scene.typical + step[-1:])
-    found = replace(scene, typical=float(typical[0]), off=float(np.sqrt(left[-1, -1])))
-    return Relative(r, step[:-1], left[:-1, :-1], found)
+    found = replace(
+        parts,
+        typical=parts.typical + step[of_parts],
+        covariance=left[of_parts, of_parts],
+    )
+    n_poses = of_parts.start
+    return Relative(r, step[:n_poses], left[:n_poses, :n_poses], found)
 
 
 def held_by_one(
