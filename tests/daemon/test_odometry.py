@@ -178,6 +178,40 @@ def test_a_new_map_that_shows_little_of_the_place_ends_no_odometry() -> None:
     run(scenario())
 
 
+@pytest.mark.parametrize(
+    ("own", "on_map", "is_own"),
+    [
+        ((0.4, 0.002), (0.3, 0.025), True),  # few patches of the map, close together
+        ((0.4, 0.002), (0.3, 0.003), False),
+        ((0.1, 0.002), (0.3, 0.003), True),
+        ((0.1, 0.002), (0.09, 0.002), False),
+    ],
+)
+def test_the_surer_one_is_believed_and_none_that_hardly_knows_how_it_is_turned(
+    own: tuple[float, float], on_map: tuple[float, float], is_own: bool
+) -> None:
+    _, templates = chart()
+    work_options = WorkOptions((), demo.MAP_OPTIONS, OPTIONS, ("akaze",), InterMavOptions(), True)
+    work = MapWork(Workshop(SENSOR, work_options), forks=False)
+    odometry = Odometry(SENSOR, DRONE, work)
+    truth = truth_at(0.0)
+
+    def told(sigmas: tuple[float, float]) -> Localized:
+        covariance = np.diag(np.repeat(sigmas, 3) ** 2)
+        no_map = np.zeros((6, 6))
+        return Localized(truth, covariance, no_map, no_map, no_map, 99, 90, True, 0.1, by="patches")
+
+    odometry.note(
+        Frame(photograph(truth, np.random.default_rng(1)), 0, 0, 0),
+        told(on_map),
+        templates,
+        (b"", 0),
+    )
+    assert odometry.tells_more(told(own), told(on_map)) == is_own
+    assert odometry.tells_more(told(own), NotLocalized("no landmark in view"))
+    work.end()
+
+
 @pytest.mark.parametrize("gap_s", [0.0, 0.01])
 def test_frames_that_bring_nothing_are_not_kept(gap_s: float) -> None:
     """Hovering; and one that is told again."""

@@ -96,6 +96,10 @@ def test_fixes_that_all_come_late_are_believed_at_last_when_they_contradict() ->
     assert all(isinstance(one, NotLocalized) and "turned" in one.reason for one in taken[:4])
     assert isinstance(taken[4], FilterState)
     assert mine.n_resets == 1
+    # What has come since leads on from there.
+    newest = mine._history.newest
+    assert newest is not None
+    assert newest.at_ns == 533_000_000
     goes_on = mine.predicted(600_000_000, wrong)
     assert goes_on is not None
     np.testing.assert_allclose(goes_on.world_from_body.rotation, BODY, atol=1e-6)

@@ -96,6 +96,25 @@ def test_what_own_frames_told_gives_way_to_the_map_whenever_that_comes() -> None
     np.testing.assert_allclose(after.velocity_world, [1.5, 0.5, 0.0], atol=0.1)
 
 
+def test_who_begins_anew_in_the_past_goes_on_from_there_by_own_frames() -> None:
+    """A map that comes late has them a metre off: the newest state is not as old as its frame."""
+    history, _ = flown(np.random.default_rng(3), 5)
+    for k in range(5, 10):
+        vague = fix_at(truth_at(k)).keyframe_covariance * 1e3
+        advance(history, k, replace(fix_at(truth_at(k)), by="odometry", keyframe_covariance=vague))
+    off = np.array([1.0, 0.0, 0.0])
+    there = fix_at(Pose(truth_at(6).rotation, truth_at(6).translation + off), 0.005)
+    state = started(there, 6 * FRAME_NS, truth_at(6).rotation, OPTIONS)
+    assert history.restart(state, there)
+    begun = history.own_fix_at(6 * FRAME_NS)
+    assert begun is not None
+    assert_pose_close(begun.world_from_body, there.world_from_body, within_m=1e-9, within_rad=1e-9)
+    assert newest(history).at_ns == 9 * FRAME_NS
+    assert newest(history).pose_covariance()[:3, :3].max() < 0.5**2
+    unknown = replace(state, at_ns=6 * FRAME_NS + FRAME_NS // 2)
+    assert not history.restart(unknown, there)
+
+
 def sharp(sigma_m: float = 0.005) -> Array:
     return np.diag([sigma_m**2] * 3 + [(sigma_m / ARM_M) ** 2] * 3)
 

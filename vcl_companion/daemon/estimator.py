@@ -242,6 +242,8 @@ class Estimator:
             elif not self._begins_anew(fix):
                 self.take_nothing(predicted, at_ns, ned_from_body)
                 return updated
+            else:
+                self._history.clear()
         elif self._has_begun:
             self._relocalized(fix)
         self._n_contradicted = 0
@@ -261,7 +263,10 @@ class Estimator:
             if not self._begins_anew(fix):
                 return state
             state = started(fix, at_ns, before.ned_from_body, self._options)
-            self._history.append(state, fix, before.ned_from_body)
+            # Where our own frames lead on from there, they do.
+            if not self._history.restart(state, fix):
+                self._history.clear()
+                self._history.append(state, fix, before.ned_from_body)
         elif state.n_jumps > before.n_jumps:
             self._relocalized(fix)
         self._n_contradicted = 0
@@ -344,7 +349,7 @@ class Estimator:
         return newest is not None and at_ns < newest.at_ns
 
     def _begins_anew(self, fix: Localized) -> bool:
-        """Count a fix against the state; leave the state, and return True, if it is believed now.
+        """Count a fix against the state; return whether it is believed now, and the state is not.
 
         One is wrong; several in a row say that the state is, or that the autopilot has turned
         its north.
@@ -353,7 +358,6 @@ class Estimator:
         if self._n_contradicted < _MAX_CONTRADICTED:
             return False
         self._relocalized(fix)
-        self._history.clear()
         return True
 
     def _relocalized(self, fix: Localized) -> None:

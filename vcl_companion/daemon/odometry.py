@@ -42,6 +42,9 @@ _NEWS = 0.3
 _COVERED, _OF_MOST = 0.65, 0.85
 # A local map is asked as well where the swarm's fills less, and believed where it is clearly surer.
 _HARDLY_COVERED, _CLEARLY_SURER = 0.4, 0.8
+# And not where own frames tell how it is turned so many times better: few patches of the map that
+# lie close together tell neither, and are soon wrong.
+_TURNED_SURER = 4.0
 # Landmarks of a map by which it is told how far its scene is.
 _N_FOR_DEPTH = 2000
 
@@ -91,8 +94,12 @@ class Odometry:
         """Whether what the local map says of a frame is to be believed, and not the swarm's."""
         if isinstance(on_map, NotLocalized) or self._scene is None:
             return True
-        vague, vague_on_map = (self._scene.vagueness(fix.covariance())[0] for fix in (own, on_map))
-        return bool(vague < _CLEARLY_SURER**2 * vague_on_map)
+        known, by_map = own.covariance(), on_map.covariance()
+        vague, vague_on_map = (self._scene.vagueness(c)[0] for c in (known, by_map))
+        turned, turned_by_map = (float(np.trace(c[3:, 3:])) for c in (known, by_map))
+        return bool(
+            vague < _CLEARLY_SURER**2 * vague_on_map or _TURNED_SURER**2 * turned < turned_by_map
+        )
 
     def note(self, frame: Frame, fix: Localized, seen: Templates, world: tuple[bytes, int]) -> None:
         """Take in where a frame was taken; a local map may be made of it.

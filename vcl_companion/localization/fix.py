@@ -37,7 +37,7 @@ class Localized:
         own_map_covariance: (6, 6) local, from the used landmarks' own errors and
             from how differently they look from here.
         map_lever: (6, 6V) local pose error per keyframe error of the map; by a map of own views
-            (6, 6V + 1), the last one per what was expected wrongly of all depths.
+            (6, 6V + K), the last ones per what was expected wrongly of K parts' depths.
         keyframe_covariance: (6V, 6V) of those, or as much more.
         n_matched: landmarks matched.
         n_inliers: of these, how many agree.

@@ -162,6 +162,19 @@ class PoseHistory:
             return None
         return updated
 
+    def restart(self, state: FilterState, fix: Localized) -> bool:
+        """Begin anew at a frame, and bring what came after it up to date.
+
+        Args:
+            state: of that frame's instant, which was kept.
+            fix: what it has begun with.
+
+        Returns:
+            Whether what came since leads on from there.
+        """
+        k = self._nearest(state.at_ns)
+        return k is not None and self._replay(k, _Step(state, fix, self._steps[k].ned_from_body))
+
     def _replay(self, k: int, changed: _Step) -> bool:
         """Change a step, and apply again what came after it; False where that cannot be."""
         replayed = [changed]
