@@ -44,7 +44,7 @@ _COVERED, _OF_MOST = 0.65, 0.85
 _HARDLY_COVERED, _CLEARLY_SURER = 0.4, 0.8
 # And not where own frames tell how it is turned so many times better: few patches of the map that
 # lie close together tell neither, and are soon wrong.
-_TURNED_SURER = 4.0
+_TURNED_SURER = 8.0
 # Landmarks of a map by which it is told how far its scene is.
 _N_FOR_DEPTH = 2000
 
