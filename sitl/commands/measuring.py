@@ -256,12 +256,26 @@ def scale(drones: str, loss: float, seed: int, out: Path) -> None:
     metavar="DEG",
     help="How newly a map looks before it is extended: 5 as in flight, fewer for more often.",
 )
+@click.option(
+    "--alone",
+    default=3.0,
+    show_default=True,
+    type=click.FloatRange(min=0.0, max=600.0),
+    metavar="SECONDS",
+    help="For how long drones then go on by their own frames alone.",
+)
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0))
 @click.option(
     "--out", default=Path("out/consistency"), show_default=True, metavar="DIR", type=FOLDER
 )
 def consistency(
-    recordings: tuple[Path, ...], starts: int, extensions: int, novelty: float, seed: int, out: Path
+    recordings: tuple[Path, ...],
+    starts: int,
+    extensions: int,
+    novelty: float,
+    alone: float,
+    seed: int,
+    out: Path,
 ) -> None:
     """Measure whether maps and poses err as much as they say, by many maps of each RECORDING.
 
@@ -278,6 +292,6 @@ def consistency(
     from sitl.consistency.report import show_consistency
 
     console = Console()
-    options = ConsistencyOptions(starts, extensions, novelty, seed)
+    options = ConsistencyOptions(starts, extensions, novelty, seed, alone)
     report = measured(recordings, out, options, lambda text: console.out(text, highlight=False))
     show_consistency(console, report, out)

@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sitl.consistency.alone import PREDICTED, Shot, found_alone
 from sitl.daemon_config import TRUE_DISTANCE_SIGMA_M
+from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.map_offer import MapOffer, ReadyMap
 from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.geometry.pose import Pose
@@ -30,8 +32,8 @@ _MAPPING = MapOptions(distance_sigma_m=TRUE_DISTANCE_SIGMA_M)
 _PIPELINE = PipelineOptions(FeatureOptions(), LocalizationOptions(), TrackingOptions())
 _UPDATES = UpdateOptions()
 _ATTITUDE_DEG = 0.3
-# A prediction as a filter's between frames, 1 sigma; it is told as twice that.
-_PREDICTED = np.array([0.02] * 3 + [0.002] * 3)
+# For so long before a map's end its frames are followed on it, to go on by them.
+_BEFORE_S = 4.0
 # Frames of drones that lie no further apart than this share of a period are of one instant.
 _AT_ONCE = 0.5
 _MOST_BYTES = 1 << 20
@@ -106,6 +108,34 @@ class Chain:
             if self._n_extensions == n_extensions or not self._extended(looks):
                 return
 
+    def alone(self, for_s: float) -> Iterator[Look]:
+        """Have each drone go on by its own frames alone from where these maps end."""
+        if self._map is None or self._current.templates is None:
+            return
+        first_ns, last_ns = self._instants[0], self._instants[-1]
+        latest_ns = max(last_ns - round(for_s * 1e9), first_ns + round(_BEFORE_S * 1e9))
+        ends_ns = min(self._instants[self._at], latest_ns)
+        for i in self._there():
+            drone, templates = self._drones[i], self._current.templates
+            on_map = self._shots(i, ends_ns - round(_BEFORE_S * 1e9), ends_ns)
+            beyond = self._shots(i, ends_ns, ends_ns + round(for_s * 1e9))
+            options = replace(_PIPELINE, drone_id=i + 1)
+            found = found_alone(
+                on_map, beyond, templates, drone.sensor, self._workshop, options, self._rng
+            )
+            for shot, fix in zip(beyond, found, strict=bool(found)):
+                yield Look(i, self._n_extensions, shot.true, fix)
+
+    def _shots(self, i: int, after_ns: int, until_ns: int) -> list[Shot]:
+        """Return a drone's frames of some time of which there is a truth."""
+        drone, out = self._drones[i], []
+        for k, frame in enumerate(drone.frames):
+            true = None if drone.truth is None else drone.truth.pose_at(frame.at_ns)
+            if after_ns < frame.at_ns <= until_ns and true is not None:
+                image = load_image(frame.path, drone.sensor.camera)
+                out.append(Shot(Frame(image, frame.at_ns, k, 0), self._world_from_ned @ true))
+        return out
+
     def _begun(self) -> bool:
         there = self._there()
         if self._leader not in there:
@@ -150,8 +180,8 @@ class Chain:
         if templates is None:
             raise RuntimeError("a map is not ready to be tracked")
         prior = Prior(
-            true.retracted(_PREDICTED * self._rng.standard_normal(6)),
-            np.diag((2.0 * _PREDICTED) ** 2),
+            true.retracted(PREDICTED * self._rng.standard_normal(6)),
+            np.diag((2.0 * PREDICTED) ** 2),
         )
         fix = track(
             self._image(i), drone.sensor.camera, drone.sensor.body_from_cam, templates, prior,

@@ -35,14 +35,18 @@ class ConsistencyOptions:
         novelty_deg: how newly a map looks before it is extended; the more often it is, the more
             of its error is what its extensions have in common, and the less is told.
         seed: of the errors of attitudes and predictions.
+        alone_s: for how long drones then go on by their own frames alone.
     """
 
     starts: int = 8
     extensions: int = 5
     novelty_deg: float = UpdateOptions().novelty_deg
     seed: int = 0
+    alone_s: float = 3.0
 
     def __post_init__(self) -> None:
+        if not 0.0 <= self.alone_s <= 600.0:
+            raise ConfigError(f"--alone must lie in 0..600 seconds, got {self.alone_s}")
         if not 0.0 < self.novelty_deg <= 90.0:
             raise ConfigError(f"--novelty must lie in 0..90 degrees, got {self.novelty_deg}")
 
@@ -95,5 +99,5 @@ def _beginnings(recording: Recording, options: ConsistencyOptions, told: Told) -
         told(f"{recording.name}: maps from frame {begins} on")
         chain = Chain(recording, begins, options.seed, options.novelty_deg)
         looks = tuple(chain.looks(step, options.extensions))
-        out.append(Beginning(begins, looks, chain.ended))
+        out.append(Beginning(begins, looks, chain.ended, tuple(chain.alone(options.alone_s))))
     return out

@@ -23,12 +23,17 @@ _FAR = 22.5
 _OF_EACH = "of each"
 _COLUMNS = ("recording", "instants", "poses", "lost", "NEES", "first map", "later", _OF_EACH,
             "> 22.5 %", "in 3 sigma %", "error cm")  # fmt: skip
+_ALONE = ("recording", "poses", "lost", "NEES", "in 3 sigma %", "error cm", "at most")
 _HOW = (
     "Maps begun at many instants of each recording and extended from there; poses by their "
     "patches alone, against the truth. *NEES*: median of the normalized squared error of all "
     "poses, 6 degrees of freedom, 5.35 of a normal error; on first maps, on later ones, and of "
     "each beginning, which is one draw of its map's error. *Lost*: frames that patches did not "
     "find. *Error*: median of the position's."
+)
+_HOW_ALONE = (
+    "From where these maps end, each drone by its own last frames alone. *NEES*: median; *error*: "
+    "of the position, median and largest."
 )
 
 
@@ -40,11 +45,13 @@ class Beginning:
         begins: index of the leader's frame that it began with.
         looks: all frames looked for.
         ended: why it could not be begun, or not be extended; empty otherwise.
+        alone: the frames after its end, by drones' own ones.
     """
 
     begins: int
     looks: tuple[Look, ...]
     ended: str
+    alone: tuple[Look, ...] = ()
 
 
 def nees_of(look: Look) -> float:
@@ -76,10 +83,26 @@ def recording_report(beginnings: Sequence[Beginning]) -> dict[str, Any]:
         "within_3_sigma_share": float(np.mean([e[1] for e in errors])) if found else None,
         "position_error_m_median": _median(np.array([e[0] for e in errors])),
         "ended": {str(one.begins): one.ended for one in beginnings if one.ended},
+        "own_frames": _own_frames([look for one in beginnings for look in one.alone]),
     }
     checked = rounded(report)
     assert isinstance(checked, dict)
     return checked
+
+
+def _own_frames(looks: list[Look]) -> dict[str, Any]:
+    """Return what poses by own frames alone come to."""
+    found = [look for look in looks if look.fix is not None]
+    errors = [_position(look) for look in found]
+    off_m = np.array([e[0] for e in errors])
+    return {
+        "poses": len(found),
+        "lost": len(looks) - len(found),
+        "nees_median": _median(np.array([nees_of(look) for look in found])),
+        "within_3_sigma_share": float(np.mean([e[1] for e in errors])) if found else None,
+        "position_error_m_median": _median(off_m),
+        "position_error_m_most": float(off_m.max()) if found else None,
+    }
 
 
 def _position(look: Look) -> tuple[float, bool]:
@@ -99,13 +122,17 @@ def write_consistency(out: Path, recordings: dict[str, dict[str, Any]]) -> dict[
     report = {"machine": machine(), "nees_wanted": list(NEES_MEDIAN), "recordings": recordings}
     text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
     (out / "consistency.json").write_text(text + "\n", encoding="utf-8")
-    lines = ["# Errors as they are told", "", _HOW, "", "| " + " | ".join(_COLUMNS) + " |"]
-    lines += ["|---|" + "---:|" * (len(_COLUMNS) - 1)]
-    rows = [[cell.replace("|", "\\|") for cell in row] for row in _rows(recordings)]
-    lines += ["| " + " | ".join(row) + " |" for row in rows]
+    lines = ["# Errors as they are told", "", _HOW, "", *_table(_COLUMNS, _rows(recordings))]
     lines += ["", *(f"* {text}" for text in _ends(recordings))]
+    lines += ["", _HOW_ALONE, "", *_table(_ALONE, _rows_alone(recordings))]
     (out / "consistency.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return report
+
+
+def _table(columns: Sequence[str], rows: list[tuple[str, ...]]) -> list[str]:
+    """Return the lines of a table in Markdown."""
+    lines = ["| " + " | ".join(columns) + " |", "|---|" + "---:|" * (len(columns) - 1)]
+    return lines + ["| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in rows]
 
 
 def show_consistency(console: Console, report: dict[str, Any], out: Path) -> None:
@@ -114,6 +141,7 @@ def show_consistency(console: Console, report: dict[str, Any], out: Path) -> Non
     shown = [n for n, head in enumerate(_COLUMNS) if head != _OF_EACH]
     rows = _rows(report["recordings"])
     print_table(console, [_COLUMNS[n] for n in shown], [[row[n] for n in shown] for row in rows])
+    print_table(console, list(_ALONE), [list(row) for row in _rows_alone(report["recordings"])])
     for text in _ends(report["recordings"]):
         console.print(text, markup=False, highlight=False, soft_wrap=True)
     path = out / "consistency.md"
@@ -137,6 +165,21 @@ def _rows(recordings: dict[str, dict[str, Any]]) -> list[tuple[str, ...]]:
         )
         for name, of in recordings.items()
     ]  # fmt: skip
+
+
+def _rows_alone(recordings: dict[str, dict[str, Any]]) -> list[tuple[str, ...]]:
+    return [
+        (
+            name,
+            str(of["own_frames"]["poses"]),
+            str(of["own_frames"]["lost"]),
+            _number(of["own_frames"]["nees_median"]),
+            _number(of["own_frames"]["within_3_sigma_share"], 100.0),
+            _number(of["own_frames"]["position_error_m_median"], 100.0),
+            _number(of["own_frames"]["position_error_m_most"], 100.0),
+        )
+        for name, of in recordings.items()
+    ]
 
 
 def _ends(recordings: dict[str, dict[str, Any]]) -> list[str]:

@@ -45,7 +45,14 @@ def test_poses_of_many_maps_err_as_much_as_they_say(
     assert 0.5 < of["nees_median"] < 15.0
     assert of["within_3_sigma_share"] > 0.9
     assert 1e-4 < of["position_error_m_median"] < 0.05
+    alone = of["own_frames"]
+    assert alone["poses"] >= 30
+    assert alone["lost"] <= alone["poses"] // 5
+    assert 0.1 < alone["nees_median"] < 25.0
+    assert alone["within_3_sigma_share"] > 0.9
+    assert alone["position_error_m_most"] < 0.3
     table = (out / "consistency.md").read_text(encoding="utf-8")
+    assert f"| {100 * alone['position_error_m_most']:.1f} |" in table
     assert f"| {of['nees_median']:.1f} |" in table
 
 
@@ -102,7 +109,13 @@ def test_what_is_told_of_poses() -> None:
     assert report["far_share"] == pytest.approx(1 / 3, abs=1e-5)
     assert report["within_3_sigma_share"] == pytest.approx(2 / 3, abs=1e-5)
     assert report["ended"] == {"7": "too little"}
-    nothing = recording_report([Beginning(0, (lost,), "no map")])
+    assert report["own_frames"]["position_error_m_most"] is None
+    nothing = recording_report([Beginning(0, (lost,), "no map", (sure, wrong, lost))])
+    alone = nothing["own_frames"]
+    assert (alone["poses"], alone["lost"]) == (2, 1)
+    assert alone["nees_median"] == pytest.approx(78.0, rel=1e-3)
+    assert alone["within_3_sigma_share"] == 0.5
+    assert alone["position_error_m_most"] == pytest.approx(5e-3 * 3**0.5, rel=1e-2)
     assert nothing["nees_median"] is None
     assert nothing["lost"] == 1
 
@@ -135,6 +148,18 @@ def test_what_cannot_be_used_is_said_in_a_line(tmp_path: Path) -> None:
     status, text = run(untold, "--out", tmp_path / "out")
     assert status == 2
     assert "known_distance" in text
+
+
+def test_who_is_to_go_on_alone_for_longer_than_there_are_frames_does_so_to_the_last() -> None:
+    chain = Chain(read_recording(DEMO), 0, seed=3, novelty_deg=5.0)
+    assert list(chain.alone(3.0)) == []  # there is no map
+    for _ in chain.looks(8, 0):
+        pass
+    # Twelve seconds at 5 Hz; by the first four it is got ready. The third one hovers until then.
+    alone = list(chain.alone(600.0))
+    assert [look.drone for look in alone] == [i for i in range(2) for _ in range(len(alone) // 2)]
+    assert 35 <= len(alone) // 2 <= 41
+    assert sum(look.fix is None for look in alone) <= len(alone) // 5
 
 
 def test_a_drone_is_left_out_where_it_has_no_frame_or_no_truth() -> None:

@@ -1,0 +1,121 @@
+"""A drone that goes on by its own frames from where a map ends, as its daemon does."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vcl_companion.cameras.source import Frame
+from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.odometry import Odometry
+from vcl_companion.daemon.workshop import Workshop
+from vcl_companion.geometry.pose import Pose
+from vcl_companion.localization.fix import Localized, Prior
+from vcl_companion.localization.pipeline import PipelineOptions, follow
+from vcl_companion.mapping.templates import Templates
+from vcl_companion.recording.sensor import Sensor
+
+PREDICTED = np.array([0.02] * 3 + [0.002] * 3)
+"""A prediction as a filter's between frames, 1 sigma; it is told as twice that."""
+_PRIOR_COVARIANCE = np.diag((2.0 * PREDICTED) ** 2)
+# As if the map showed so little: own frames are got ready.
+_LITTLE = 0.1
+_WORLD = b"", 0
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A frame, and world_from_body where it was taken, by the truth."""
+
+    frame: Frame
+    true: Pose
+
+
+def found_alone(
+    on_map: Sequence[Shot],
+    beyond: Sequence[Shot],
+    templates: Templates,
+    sensor: Sensor,
+    workshop: Workshop,
+    options: PipelineOptions,
+    rng: np.random.Generator,
+) -> list[Localized | None]:
+    """Follow a drone on a map, and from where that ends by its own frames.
+
+    Args:
+        on_map: frames that the map may show, the last one at its end.
+        beyond: those after, for which there is no map.
+        templates: the map.
+        sensor: the drone's.
+        workshop: makes local maps.
+        options: of the steps, with the drone's id.
+        rng: of the predictions' errors.
+
+    Returns:
+        Where those beyond are found, None where they are lost; nothing of who has hardly moved
+        before, and has no own frames to go on by.
+    """
+    return asyncio.run(_Flight(templates, sensor, workshop, options, rng).flown(on_map, beyond))
+
+
+class _Flight:
+    def __init__(
+        self,
+        templates: Templates,
+        sensor: Sensor,
+        workshop: Workshop,
+        options: PipelineOptions,
+        rng: np.random.Generator,
+    ) -> None:
+        self._templates = templates
+        self._sensor = sensor
+        self._work = MapWork(workshop, forks=False)
+        self._options = options
+        self._rng = rng
+        self._odometry = Odometry(sensor, options.drone_id or 0, self._work)
+        # Of the last fix: a prediction is off as that is.
+        self._off = np.zeros(6)
+
+    async def flown(self, on_map: Sequence[Shot], beyond: Sequence[Shot]) -> list[Localized | None]:
+        making = asyncio.create_task(self._odometry.run())
+        is_first = True
+        for shot in on_map:
+            fix = self._found(shot, self._templates)
+            if fix is not None:
+                covered = fix.covered if is_first else min(fix.covered, _LITTLE)
+                await self._note(shot, replace(fix, covered=covered), self._templates)
+                is_first = False
+        out: list[Localized | None] = []
+        for shot in beyond if self._odometry.templates is not None else ():
+            local = self._odometry.templates
+            fix = None if local is None else self._found(shot, local)
+            if fix is not None and local is not None:
+                fix = replace(fix, by="odometry")
+                await self._note(shot, fix, local)
+            out.append(fix)
+        making.cancel()
+        with suppress(asyncio.CancelledError):
+            await making
+        self._work.end()
+        return out
+
+    async def _note(self, shot: Shot, fix: Localized, seen: Templates) -> None:
+        self._odometry.note(shot.frame, fix, seen, _WORLD)
+        await self._odometry.settled()
+
+    def _found(self, shot: Shot, templates: Templates) -> Localized | None:
+        where = shot.true.retracted(self._off).retracted(
+            PREDICTED * self._rng.standard_normal(len(PREDICTED))
+        )
+        fix = follow(
+            shot.frame.image, self._sensor.camera, self._sensor.body_from_cam, templates,
+            Prior(where, _PRIOR_COVARIANCE), None, self._options,
+        )  # fmt: skip
+        if not isinstance(fix, Localized):
+            return None
+        self._off = shot.true.local(fix.world_from_body)
+        return fix
