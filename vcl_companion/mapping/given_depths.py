@@ -31,7 +31,7 @@ _PARTS = (4, 3)
 # A patch lies so far before or behind what is about it, logarithm of distances, 1 sigma. Taken for
 # much more than it is, what noise does to depths that hardly any parallax tells would pass for
 # relief, and who moves over relief that is not there seems not to move.
-_RELIEF = 0.4
+_RELIEF = 0.3
 
 
 @dataclass(frozen=True)
