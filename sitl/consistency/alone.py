@@ -19,9 +19,8 @@ from vcl_companion.localization.pipeline import PipelineOptions, follow
 from vcl_companion.mapping.templates import Templates
 from vcl_companion.recording.sensor import Sensor
 
-PREDICTED = np.array([0.02] * 3 + [0.002] * 3)
-"""A prediction as a filter's between frames, 1 sigma; it is told as twice that."""
-_PRIOR_COVARIANCE = np.diag((2.0 * PREDICTED) ** 2)
+# A prediction as a filter's between frames, 1 sigma; it is told as twice that.
+_PREDICTED = np.array([0.02] * 3 + [0.002] * 3)
 # As if the map showed so little: own frames are got ready.
 _LITTLE = 0.1
 _WORLD = b"", 0
@@ -33,6 +32,12 @@ class Shot:
 
     frame: Frame
     true: Pose
+
+
+def predicted(where: Pose, rng: np.random.Generator) -> Prior:
+    """Return where a filter may expect a drone that is somewhere."""
+    off = _PREDICTED * rng.standard_normal(len(_PREDICTED))
+    return Prior(where.retracted(off), np.diag((2.0 * _PREDICTED) ** 2))
 
 
 def found_alone(
@@ -108,12 +113,10 @@ class _Flight:
         await self._odometry.settled()
 
     def _found(self, shot: Shot, templates: Templates) -> Localized | None:
-        where = shot.true.retracted(self._off).retracted(
-            PREDICTED * self._rng.standard_normal(len(PREDICTED))
-        )
+        prior = predicted(shot.true.retracted(self._off), self._rng)
         fix = follow(
             shot.frame.image, self._sensor.camera, self._sensor.body_from_cam, templates,
-            Prior(where, _PRIOR_COVARIANCE), None, self._options,
+            prior, None, self._options,
         )  # fmt: skip
         if not isinstance(fix, Localized):
             return None

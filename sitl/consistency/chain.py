@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sitl.consistency.alone import PREDICTED, Shot, found_alone
+from sitl.consistency.alone import Shot, found_alone, predicted
 from sitl.daemon_config import TRUE_DISTANCE_SIGMA_M
 from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.map_offer import MapOffer, ReadyMap
@@ -110,7 +110,7 @@ class Chain:
 
     def alone(self, for_s: float) -> Iterator[Look]:
         """Have each drone go on by its own frames alone from where these maps end."""
-        if self._map is None or self._current.templates is None:
+        if self._map is None or self._current.templates is None or not for_s:
             return
         first_ns, last_ns = self._instants[0], self._instants[-1]
         latest_ns = max(last_ns - round(for_s * 1e9), first_ns + round(_BEFORE_S * 1e9))
@@ -130,8 +130,10 @@ class Chain:
         """Return a drone's frames of some time of which there is a truth."""
         drone, out = self._drones[i], []
         for k, frame in enumerate(drone.frames):
-            true = None if drone.truth is None else drone.truth.pose_at(frame.at_ns)
-            if after_ns < frame.at_ns <= until_ns and true is not None:
+            if drone.truth is None or not after_ns < frame.at_ns <= until_ns:
+                continue
+            true = drone.truth.pose_at(frame.at_ns)
+            if true is not None:
                 image = load_image(frame.path, drone.sensor.camera)
                 out.append(Shot(Frame(image, frame.at_ns, k, 0), self._world_from_ned @ true))
         return out
@@ -179,13 +181,9 @@ class Chain:
         true = self._world_from_ned @ self._truth(i)
         if templates is None:
             raise RuntimeError("a map is not ready to be tracked")
-        prior = Prior(
-            true.retracted(PREDICTED * self._rng.standard_normal(6)),
-            np.diag((2.0 * PREDICTED) ** 2),
-        )
         fix = track(
-            self._image(i), drone.sensor.camera, drone.sensor.body_from_cam, templates, prior,
-            None, _PIPELINE.tracking, _PIPELINE.localization, i + 1,
+            self._image(i), drone.sensor.camera, drone.sensor.body_from_cam, templates,
+            predicted(true, self._rng), None, _PIPELINE.tracking, _PIPELINE.localization, i + 1,
         )  # fmt: skip
         return Look(i, self._n_extensions, true, fix if isinstance(fix, Localized) else None)
 

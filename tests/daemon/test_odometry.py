@@ -67,14 +67,19 @@ class Failing(Workshop):
         raise np.linalg.LinAlgError("singular")
 
 
+def keeping(shop: type[Workshop] = Workshop) -> tuple[Odometry, MapWork]:
+    """Return what keeps local maps, and what makes them."""
+    options = WorkOptions((), demo.MAP_OPTIONS, OPTIONS, ("akaze",), InterMavOptions(), True)
+    work = MapWork(shop(SENSOR, options), forks=False)
+    return Odometry(SENSOR, DRONE, work), work
+
+
 async def flown(
     rng: np.random.Generator, *, goes_on: bool, shop: type[Workshop] = Workshop
 ) -> list[Flown]:
     """Fly there and back; with or without going on by own frames where the map ends."""
     index, templates = chart()
-    work_options = WorkOptions((), demo.MAP_OPTIONS, OPTIONS, ("akaze",), InterMavOptions(), True)
-    work = MapWork(shop(SENSOR, work_options), forks=False)
-    odometry = Odometry(SENSOR, DRONE, work)
+    odometry, work = keeping(shop)
     making = asyncio.create_task(odometry.run())
     options = replace(OPTIONS, drone_id=DRONE)
     estimator = Estimator(MOTION, OPTIONS.localization, lambda _: None)
@@ -151,9 +156,7 @@ def test_where_no_local_map_can_be_made_it_flies_on_by_the_map() -> None:
 def test_a_new_map_that_shows_little_of_the_place_ends_no_odometry() -> None:
     async def scenario() -> None:
         _, templates = chart()
-        options = WorkOptions((), demo.MAP_OPTIONS, OPTIONS, ("akaze",), InterMavOptions(), True)
-        work = MapWork(Workshop(SENSOR, options), forks=False)
-        odometry = Odometry(SENSOR, DRONE, work)
+        odometry, work = keeping()
         making = asyncio.create_task(odometry.run())
         small = np.diag(np.repeat([0.01, 0.001], 3) ** 2)
         another = templates.uncertainty.keyframe_covariance.copy()
@@ -191,9 +194,7 @@ def test_the_surer_one_is_believed_and_none_that_hardly_knows_how_it_is_turned(
     own: tuple[float, float], on_map: tuple[float, float], is_own: bool
 ) -> None:
     _, templates = chart()
-    work_options = WorkOptions((), demo.MAP_OPTIONS, OPTIONS, ("akaze",), InterMavOptions(), True)
-    work = MapWork(Workshop(SENSOR, work_options), forks=False)
-    odometry = Odometry(SENSOR, DRONE, work)
+    odometry, work = keeping()
     truth = truth_at(0.0)
 
     def told(sigmas: tuple[float, float]) -> Localized:
@@ -218,9 +219,7 @@ def test_frames_that_bring_nothing_are_not_kept(gap_s: float) -> None:
 
     async def scenario() -> None:
         _, templates = chart()
-        options = WorkOptions((), demo.MAP_OPTIONS, OPTIONS, ("akaze",), InterMavOptions(), True)
-        work = MapWork(Workshop(SENSOR, options), forks=False)
-        odometry = Odometry(SENSOR, DRONE, work)
+        odometry, work = keeping()
         truth = truth_at(0.0)
         image = photograph(truth, np.random.default_rng(1))
         prior_covariance = np.diag(np.repeat([0.01, 0.001], 3) ** 2)

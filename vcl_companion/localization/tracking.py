@@ -338,15 +338,19 @@ class _Tracker:
         Of landmarks that the same drone's keyframes fixed the lens is off alike there: what counts
         is the difference.
         """
-        uncertainty = self._templates.uncertainty
-        if not (uncertainty.calibration_px or uncertainty.alike_px):
+        uncertainty, camera = self._templates.uncertainty, self._camera
+        causes = []
+        if uncertainty.calibration_px:
+            by_lens = lens_px(camera, found.pixels, uncertainty.calibration_px)
+            own = self._is_ours(found)
+            then = self._anchors.pixels[found.anchors[own]]
+            by_lens[own] -= lens_px(camera, then, uncertainty.calibration_px)
+            causes.append(by_lens)
+        if uncertainty.alike_px:
+            causes.append(lens_px(camera, found.pixels, uncertainty.alike_px))
+        if not causes:
             return np.zeros((6, 6))
-        by_lens = lens_px(self._camera, found.pixels, uncertainty.calibration_px)
-        own = self._is_ours(found)
-        then = self._anchors.pixels[found.anchors[own]]
-        by_lens[own] -= lens_px(self._camera, then, uncertainty.calibration_px)
-        alike = lens_px(self._camera, found.pixels, uncertainty.alike_px)
-        off_px = np.concatenate([by_lens, alike], axis=2)
+        off_px = np.concatenate(causes, axis=2)
         # In units of the residuals' sigmas, as ``j_poses``.
         first = off_px[:, 0] / roots[0][:, None]
         second = (off_px[:, 1] - roots[1][:, None] * first) / roots[2][:, None]

@@ -1,8 +1,9 @@
 """How some views lie to each other, as their patches have it, and where they are by that.
 
 A small bundle adjustment: each patch has one unknown, its inverse depth in the first view, all are
-about as far as the scene is, and the other views lie to the first one as they are believed to, more
-or less. What they are off together, against the rest of the world, patches cannot tell.
+about as far as their parts of the scene are, and the other views lie to the first one as they are
+believed to, more or less. What they are off together, against the rest of the world, patches cannot
+tell.
 """
 
 from __future__ import annotations
@@ -109,12 +110,13 @@ def adjusted(
     rays = np.column_stack([ideal, np.ones(n)])
     cam_from_body = adjoint(body_from_cam.inverse())
     # The poses, and what the parts' inverse depths are off.
-    shares, certain = parts.shares, 1.0 / parts.relief**2
+    shares, expected, certain = parts.shares, parts.expected(), 1.0 / parts.relief**2
     believed = block_diag(_inverse(covariance), _inverse(parts.covariance))
     r, step = scene.within(inverse_depths), np.zeros(len(believed))
-    of_parts = slice(6 * (v - 1), None)
+    n_poses = 6 * (v - 1)
+    of_parts = slice(n_poses, None)
     for limit_px in _LIMITS_PX:
-        off_scene = parts.expected() + shares @ step[of_parts] - np.log(r)
+        off_scene = expected + shares @ step[of_parts] - np.log(r)
         r_information, r_pull = np.full(n, certain), certain * off_scene
         seen, pull = np.zeros_like(believed), np.zeros(len(believed))
         seen[of_parts, of_parts] = certain * shares.T @ shares
@@ -155,7 +157,6 @@ def adjusted(
         typical=parts.typical + step[of_parts],
         covariance=left[of_parts, of_parts],
     )
-    n_poses = of_parts.start
     return Relative(r, step[:n_poses], left[:n_poses, :n_poses], found)
 
 
