@@ -36,6 +36,7 @@ DRONE, PER_S, LENGTH_S = 7, 10, 9.0
 LEAVES_S, TURNS_S, RETURNS_S = 0.8, 3.4, 5.2
 MOTION = FilterOptions()
 SENSOR = Sensor(PINHOLE, MOUNTING, float(PER_S))
+WORLD = b"world", 0
 
 
 def truth_at(at_s: float) -> Pose:
@@ -75,9 +76,16 @@ def keeping(shop: type[Workshop] = Workshop) -> tuple[Odometry, MapWork]:
 
 
 async def flown(
-    rng: np.random.Generator, *, goes_on: bool, shop: type[Workshop] = Workshop
+    rng: np.random.Generator,
+    *,
+    goes_on: bool,
+    shop: type[Workshop] = Workshop,
+    hidden: tuple[float, float] = (0.0, 0.0),
 ) -> list[Flown]:
-    """Fly there and back; with or without going on by own frames where the map ends."""
+    """Fly there and back; with or without going on by own frames where the map ends.
+
+    For the time ``hidden``, s, the map shows nothing.
+    """
     index, templates = chart()
     odometry, work = keeping(shop)
     making = asyncio.create_task(odometry.run())
@@ -92,7 +100,11 @@ async def flown(
         prior = predicted.prior() if predicted else None
         given = image, PINHOLE, MOUNTING
         fix, seen = localize(*given, index, templates, prior, attitude, options), templates
+        if hidden[0] <= at_s < hidden[1]:
+            fix = NotLocalized("0 landmarks in view, 15 needed")
         local = odometry.templates
+        if goes_on and local is None and isinstance(fix, NotLocalized):
+            local = await odometry.begun(WORLD)
         if goes_on and local is not None and prior is not None and odometry.may_tell_more(fix):
             own = follow(*given, local, prior, attitude, options)
             if isinstance(own, Localized) and odometry.tells_more(own, fix):
@@ -101,7 +113,7 @@ async def flown(
         if isinstance(fix, Localized):
             state = estimator.take_fix(predicted, fix, at_ns, attitude)
             if isinstance(state, FilterState) and fix.by != "features":
-                odometry.note(Frame(image, at_ns, k, 0), fix, seen, (b"world", 0))
+                odometry.note(Frame(image, at_ns, k, 0), fix, seen, WORLD)
         else:
             estimator.take_nothing(predicted, at_ns, attitude)
         await odometry.settled()  # here, where no time passes, before the next frame
@@ -143,6 +155,47 @@ def test_without_own_frames_it_is_lost() -> None:
     """What the test above is about: the map alone does not do it."""
     frames = asyncio.run(flown(np.random.default_rng(5), goes_on=False))
     assert sum(by(f) == "" for f in frames) >= 10
+
+
+def test_who_sees_nothing_of_the_map_from_one_frame_to_the_next_goes_on_too() -> None:
+    """No local map was wanted: the map had filled the image."""
+    gone = 2.0, 3.5
+    for goes_on in (True, False):
+        frames = asyncio.run(flown(np.random.default_rng(5), goes_on=goes_on, hidden=gone))
+        before = [f for f in frames if f.at_s < gone[0]]
+        assert not any(f.has_local_map for f in before)
+        lost = [f for f in frames if gone[0] <= f.at_s < gone[1]]
+        assert {by(f) for f in lost} == {"odometry" if goes_on else ""}
+        for f in lost if goes_on else ():
+            assert f.state is not None
+            assert float(nees(f.error, f.state.pose_covariance())[0]) < 27.9
+            assert np.linalg.norm(f.error[:3]) < 0.05
+
+
+def test_frames_of_another_world_begin_nothing() -> None:
+    async def scenario() -> None:
+        _, templates = chart()
+        odometry, work = keeping()
+        making = asyncio.create_task(odometry.run())
+        assert await odometry.begun(WORLD) is None  # nor does none
+        for k in range(5):
+            truth = truth_at(1.0 + 0.3 * k)
+            image = photograph(truth, np.random.default_rng(k))
+            where = Prior(truth, np.diag(np.repeat([0.01, 0.001], 3) ** 2))
+            fix = follow(image, PINHOLE, MOUNTING, templates, where, None, OPTIONS)
+            assert isinstance(fix, Localized)
+            told = replace(fix, covered=0.8)
+            odometry.note(Frame(image, k * 10**8, k, 0), told, templates, WORLD)
+        assert await odometry.begun((b"world", 1)) is None
+        assert await odometry.begun((b"another", 0)) is None
+        assert odometry.templates is None
+        assert await odometry.begun(WORLD) is odometry.templates is not None
+        making.cancel()
+        with suppress(asyncio.CancelledError):
+            await making
+        work.end()
+
+    run(scenario())
 
 
 def test_where_no_local_map_can_be_made_it_flies_on_by_the_map() -> None:

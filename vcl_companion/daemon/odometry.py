@@ -76,6 +76,7 @@ class Odometry:
         self._world: tuple[bytes, int] = b"", 0
         # By which keyframes, known by their covariance: a map that is left is not kept for this.
         self._most_covered: tuple[Array | None, float] = None, 0.0
+        self._begun_with: Frame | None = None
         self._wanted, self._idle = asyncio.Event(), asyncio.Event()
         self._idle.set()
 
@@ -83,6 +84,25 @@ class Odometry:
     def templates(self) -> Templates | None:
         """The local map in use, if there is one."""
         return None if self._local is None else self._local.templates
+
+    async def begun(self, world: tuple[bytes, int]) -> Templates | None:
+        """Return the local map; without one, one of the last frames, made now if it can be.
+
+        For who has been in sight of the swarm's map a frame ago and is not any more; once of the
+        same frames.
+
+        Args:
+            world: that its poses have to be in; see ``note``.
+        """
+        newest = self._window.views[-1] if self._window.views else None
+        if world != self._world or newest is None:
+            return None
+        if self._local is None and newest is not self._begun_with:
+            self._begun_with = newest
+            self._idle.clear()
+            self._wanted.set()
+            await self.settled()
+        return self.templates
 
     def may_tell_more(self, on_map: Localized | NotLocalized) -> bool:
         """Whether the local map is to be asked about a frame, by what the swarm's says of it."""

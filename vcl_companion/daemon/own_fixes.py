@@ -121,6 +121,8 @@ class OwnFixes:
         """Look at a frame by our own last frames, if these may tell more; None if they do not."""
         local = self._odometry.templates
         at_ns, ned_from_body = frame.captured_at_ns, on_map.ned_from_body
+        if local is None and isinstance(on_map.fix, NotLocalized):
+            local = await self._odometry.begun(self._world_of(on_map.stored))
         if local is None or not self._odometry.may_tell_more(on_map.fix):
             return None
         predicted = self._estimator.predicted(at_ns, ned_from_body)
@@ -186,8 +188,11 @@ class OwnFixes:
         """Remember a frame whose fix was taken: we may have to go on by it."""
         seen = look.seen
         if isinstance(look.fix, Localized) and look.fix.by != "features" and seen is not None:
-            world = look.stored.world, self._estimator.n_resets
-            self._odometry.note(frame, look.fix, seen, world)
+            self._odometry.note(frame, look.fix, seen, self._world_of(look.stored))
+
+    def _world_of(self, stored: StoredMap) -> tuple[bytes, int]:
+        """Return which world poses on a map are in, and how often we have begun in it anew."""
+        return stored.world, self._estimator.n_resets
 
     def take(
         self, frame: Frame, fix: Localized, ned_from_body: Array | None
