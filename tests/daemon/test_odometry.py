@@ -23,11 +23,13 @@ from vcl_companion.daemon.workshop import WorkOptions, Workshop
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, matrix_from_euler
 from vcl_companion.localization.filter_state import FilterState
-from vcl_companion.localization.fix import Localized, NotLocalized, Prior
+from vcl_companion.localization.fix import Localized, NotLocalized, Prior, Recognised
+from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pipeline import follow, localize
 from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.mapping.local_map import LocalMap
 from vcl_companion.mapping.options import NoMap
+from vcl_companion.mapping.templates import Templates
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.pose_requests import InterMavOptions
 
@@ -75,18 +77,32 @@ def keeping(shop: type[Workshop] = Workshop) -> tuple[Odometry, MapWork]:
     return Odometry(SENSOR, DRONE, work), work
 
 
+def anywhere(index: MapIndex, templates: Templates, sigma_m: float) -> tuple[MapIndex, Templates]:
+    """Return a map all of which may be somewhere else, as after a long flight."""
+    landmark_map = index.landmark_map
+    moved = np.vstack([k.world_from_body.rotation.T for k in landmark_map.keyframes])
+    common = np.zeros((6 * len(landmark_map.keyframes), 3))
+    common.reshape(-1, 6, 3)[:, :3] = moved.reshape(-1, 3, 3)
+    known = index.uncertainty.keyframe_covariance + sigma_m**2 * common @ common.T
+    sure = replace(index.uncertainty, keyframe_covariance=known)
+    return replace(index, uncertainty=sure), replace(templates, uncertainty=sure)
+
+
 async def flown(
     rng: np.random.Generator,
     *,
     goes_on: bool,
     shop: type[Workshop] = Workshop,
     hidden: tuple[float, float] = (0.0, 0.0),
+    vague_m: float = 0.0,
 ) -> list[Flown]:
     """Fly there and back; with or without going on by own frames where the map ends.
 
-    For the time ``hidden``, s, the map shows nothing.
+    For the time ``hidden``, s, the map shows nothing. All of it may be so far off, 1 sigma.
     """
     index, templates = chart()
+    if vague_m:
+        index, templates = anywhere(index, templates, vague_m)
     odometry, work = keeping(shop)
     making = asyncio.create_task(odometry.run())
     options = replace(OPTIONS, drone_id=DRONE)
@@ -97,16 +113,17 @@ async def flown(
         image = photograph(truth_at(at_s), rng)
         attitude = truth_at(at_s).rotation @ exp_so3(0.005 * rng.standard_normal(3))
         predicted = estimator.predicted(at_ns, attitude)
-        prior = predicted.prior() if predicted else None
+        keyframes = index.uncertainty.keyframe_covariance
+        priors = predicted.priors_on(keyframes) if predicted else (None,)
         given = image, PINHOLE, MOUNTING
-        fix, seen = localize(*given, index, templates, prior, attitude, options), templates
+        fix, seen = localize(*given, index, templates, priors[0], attitude, options), templates
         if hidden[0] <= at_s < hidden[1]:
             fix = NotLocalized("0 landmarks in view, 15 needed")
         local = odometry.templates
         if goes_on and local is None and isinstance(fix, NotLocalized):
             local = await odometry.begun(WORLD)
-        if goes_on and local is not None and prior is not None and odometry.may_tell_more(fix):
-            own = follow(*given, local, prior, attitude, options)
+        if goes_on and local is not None and predicted and odometry.may_tell_more(fix):
+            own = follow(*given, local, predicted.priors_on(None)[0], attitude, options)
             if isinstance(own, Localized) and odometry.tells_more(own, fix):
                 fix, seen = replace(own, by="odometry"), local
         state: FilterState | NotLocalized | None = None
@@ -170,6 +187,20 @@ def test_who_sees_nothing_of_the_map_from_one_frame_to_the_next_goes_on_too() ->
             assert f.state is not None
             assert float(nees(f.error, f.state.pose_covariance())[0]) < 27.9
             assert np.linalg.norm(f.error[:3]) < 0.05
+
+
+def test_who_does_not_know_where_all_of_it_is_goes_on_no_less_well() -> None:
+    """A map that is half a metre off after a long flight: own frames are off as it is."""
+    frames = asyncio.run(flown(np.random.default_rng(5), goes_on=True, vague_m=0.5))
+    away = [f for f in frames if by(f) == "odometry"]
+    assert len(away) >= 10
+    assert all(by(f) in ("patches", "odometry") for f in frames[1:])
+    for f in frames[1:]:
+        assert np.linalg.norm(f.error[:3]) < 0.1
+    for f in away:
+        assert f.state is not None
+        told_m = np.sqrt(np.diag(f.state.pose_covariance())[:3])
+        assert np.all((told_m > 0.45) & (told_m < 0.6))
 
 
 def test_frames_of_another_world_begin_nothing() -> None:
@@ -264,6 +295,27 @@ def test_the_surer_one_is_believed_and_none_that_hardly_knows_how_it_is_turned(
     assert odometry.tells_more(told(own), told(on_map)) == is_own
     assert odometry.tells_more(told(own), NotLocalized("no landmark in view"))
     work.end()
+
+
+def test_a_jump_to_where_own_frames_lead_is_no_end_of_these() -> None:
+    said: list[str] = []
+    estimator = Estimator(MOTION, OPTIONS.localization, said.append)
+    sharp, none = np.diag(np.repeat([0.01, 0.001], 3) ** 2), np.zeros((6, 6))
+
+    def takes(k: int, east_m: float, recognised: Recognised) -> tuple[int, int]:
+        there = Pose(np.eye(3), np.array([0.0, east_m, 0.0]))
+        keyframes = none if recognised == "patches" else sharp
+        fix = Localized(there, sharp, none, none, keyframes, 99, 90, True, 0.1, by=recognised)
+        predicted = estimator.predicted(k * 10**8, np.eye(3))
+        assert isinstance(estimator.take_fix(predicted, fix, k * 10**8, np.eye(3)), FilterState)
+        return estimator.n_resets, estimator.n_displaced
+
+    for k in range(10):
+        assert takes(k, 0.0, "patches") == (0, 0)
+    assert takes(10, 3.0, "patches") == (1, 1)
+    assert takes(11, 3.0, "odometry") == (1, 1)
+    assert takes(12, 0.0, "odometry") == (2, 1)
+    assert len(said) == 2
 
 
 @pytest.mark.parametrize("gap_s", [0.0, 0.01])

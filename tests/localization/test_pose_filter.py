@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.checks import assert_consistent, assert_pose_close, numeric_jacobian
+from tests.checks import assert_consistent, assert_pose_close, nees, numeric_jacobian
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, matrix_from_euler
 from vcl_companion.geometry.similarity import Similarity
@@ -256,6 +256,38 @@ def test_the_map_s_error_is_common_to_all_frames_and_does_not_average_out() -> N
     # Forty frames later the map's error is still all there, and the noise nearly gone.
     assert min(shares) > 0.999
     assert max(shares) < 1.05
+
+
+def test_where_a_map_shows_things_is_no_less_certain_for_what_it_is_off() -> None:
+    """Predictions against what the map says next: sharp, though both are off by decimetres."""
+    rng = np.random.default_rng(14)
+    tiny = 0.2 * FIX_SIGMA
+    missed, expected, wholes = [], [], []
+    for _ in range(60):
+        covariance, draw = keyframe_errors(rng)
+        flight = fly(rng, 20, STEADY)
+
+        def fix_of(pose: Pose, covariance: Array = covariance, draw: Array = draw) -> Localized:
+            found = pose.retracted(lever_in(pose) @ draw)
+            found = found.retracted(tiny * rng.standard_normal(6))
+            return fix_at(found, tiny, lever=lever_in(found), keyframe_covariance=covariance)
+
+        before = filtered(replace(flight, poses=flight.poses[:-1]), fix_of, STEADY)[-1]
+        predicted = predict(before, before.at_ns + STEP_NS, flight.attitudes[-1], STEADY)
+        assert predicted is not None
+        among, whole = predicted.priors_on(covariance)
+        assert predicted.priors_on(None)[0].covariance == pytest.approx(among.covariance)
+        assert predicted.priors_on(2.0 * covariance)[0].covariance == pytest.approx(
+            whole.covariance
+        )
+        missed.append(predicted.world_from_body.local(fix_of(flight.poses[-1]).world_from_body))
+        expected.append(among.covariance + np.diag(tiny**2))
+        # A tenth of what the keyframes are off, for those that are off otherwise.
+        wholes.append(whole.covariance)
+        assert np.trace(among.covariance[:3, :3]) < 0.2**2 * np.trace(whole.covariance[:3, :3])
+    # Of six degrees of freedom.
+    assert 3.0 < np.mean(nees(missed, expected)) < 8.0
+    assert np.mean(nees(missed, wholes)) < 2.0
 
 
 def test_a_new_map_s_error_is_a_new_one() -> None:

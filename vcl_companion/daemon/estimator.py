@@ -65,6 +65,9 @@ class Estimator:
         self._n_contradicted = 0
         self._has_begun = False
         self.n_resets = 0
+        """How often the pose has jumped."""
+        self.n_displaced = 0
+        """How often it has to where our own frames had not led: these are no help there."""
         self.local = LocalFrame(heading)
         """The frame that the autopilot is told poses in."""
         self.in_sight = MapInSight()
@@ -361,8 +364,9 @@ class Estimator:
         return True
 
     def _relocalized(self, fix: Localized) -> None:
-        self._jump(f"relocalized with {fix.n_inliers} landmarks")
+        self._jump(f"relocalized with {fix.n_inliers} landmarks", displaces=fix.is_on_map)
 
-    def _jump(self, why: str) -> None:
+    def _jump(self, why: str, *, displaces: bool = True) -> None:
         self.n_resets += 1
+        self.n_displaced += displaces
         self._jumped(why)

@@ -177,7 +177,8 @@ class FrameAnswers:
         )
         stored, seen = self._maps.current, None
         if stored is not None and state is not None and stored.templates is not None:
-            seen = await self._work.seen(np.asarray(frame.image), stored, state.prior())
+            prior, *_ = state.priors_on(stored.index.uncertainty.keyframe_covariance)
+            seen = await self._work.seen(np.asarray(frame.image), stored, prior)
         return FrameAnswer(
             drone_id=self._system_id,
             request_id=request_id,

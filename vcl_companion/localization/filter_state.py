@@ -33,6 +33,12 @@ N_OWN = 12
 GATE_POSE = 27.9
 """99.99 % of chi^2 with 6 degrees of freedom: beyond, it is not noise."""
 
+# Of the sum of the keyframes' variances; rounding leaves more.
+_EXACT = 1e-12
+# Keyframes are not off alike: what the next ones are off beside those a state was found by, as a
+# share of it.
+_UNLIKE = 0.1
+
 
 def unknown(covariance: Array, sigmas: Sequence[tuple[slice, float]]) -> Array:
     """Return an error state's covariance where nothing is known of some parts of three numbers.
@@ -89,6 +95,41 @@ class FilterState:
     def prior(self) -> Prior:
         """Return where the drone is expected, for guiding the matching."""
         return Prior(self.world_from_body, self.pose_covariance())
+
+    def priors_on(self, keyframe_covariance: Array | None) -> tuple[Prior, ...]:
+        """Return where the drone is expected on a map, or by views of its own; the surest first.
+
+        Args:
+            keyframe_covariance: of that map; None for views that this state was found by, or that
+                were found as it was.
+        """
+        if keyframe_covariance is None or self.considers(keyframe_covariance):
+            return self._prior_among_keyframes(), self.prior()
+        return (self.prior(),)
+
+    def considers(self, keyframe_covariance: Array) -> bool:
+        """Whether these are the very keyframes whose errors are considered."""
+        return np.array_equal(self.covariance[N_OWN:, N_OWN:], keyframe_covariance)
+
+    def _prior_among_keyframes(self) -> Prior:
+        """Return where the drone is expected to be seen from, by keyframes that err as it does.
+
+        What these are off, the state is off as well: that makes it no less certain where they
+        show things. After a minute's flight it is most of what it is off.
+        """
+        to_pose = self.to_pose()[:, :N_OWN]
+        own = to_pose @ self.beside_keyframes() @ to_pose.T + self.own_map_covariance
+        covariance = own + _UNLIKE**2 * (self.pose_covariance() - own)
+        return Prior(self.world_from_body, np.asarray(0.5 * (covariance + covariance.T)))
+
+    def beside_keyframes(self) -> Array:
+        """Return (12, 12) of the error state were the keyframes' errors known."""
+        known, by_keys = self.covariance[:N_OWN, :N_OWN], self.covariance[:N_OWN, N_OWN:]
+        keys = self.covariance[N_OWN:, N_OWN:]
+        # The first keyframe of a map has no error: not to be inverted as it is.
+        certain = np.eye(len(keys)) * (_EXACT * max(float(np.trace(keys)), 1.0))
+        own = known - by_keys @ np.linalg.solve(keys + certain, by_keys.T)
+        return np.asarray(0.5 * (own + own.T))
 
     def to_pose(self) -> Array:
         """Return (6, 12 + 6V) local pose perturbation by error state."""

@@ -31,8 +31,6 @@ from vcl_companion.options import require_positive
 _MAX_COAST_S = 60.0
 # Where nothing is known of a position, 1 sigma.
 _ANYWHERE_M = 1e3
-# Of the sum of the keyframes' variances; rounding leaves more.
-_EXACT = 1e-12
 
 
 @dataclass(frozen=True)
@@ -181,7 +179,7 @@ def update(predicted: FilterState, fix: Localized) -> FilterState | NotLocalized
         _observation(predicted, fix),
         fix.noise_covariance + fix.own_map_covariance,
     )
-    if not (fix.is_on_map or _is_on_map_of(before, fix)):
+    if not (fix.is_on_map or before.considers(fix.keyframe_covariance)):
         predicted = _on_own_views(before, fix, measured)
     believed = reconciled(predicted, fix, measured)
     if isinstance(believed, NotLocalized):
@@ -234,17 +232,15 @@ def _on_own_views(state: FilterState, fix: Localized, measured: Measurement) -> 
     second witness, and errs as the state does, but for what has come since. Where the state has
     learnt better meanwhile, which the fix then contradicts, only its speed is kept.
     """
-    known, by_keys = state.covariance[:N_OWN, :N_OWN], state.covariance[:N_OWN, N_OWN:]
-    keys = state.covariance[N_OWN:, N_OWN:]
-    # The first keyframe of a map has no error: not to be inverted as it is.
-    certain = np.eye(len(keys)) * (_EXACT * max(float(np.trace(keys)), 1.0))
-    own = known - by_keys @ np.linalg.solve(keys + certain, by_keys.T)
     lever = np.zeros((N_OWN, fix.map_lever.shape[1]))
     rotation = state.world_from_body.rotation
     lever[POSITION], lever[OFFSET] = -rotation @ fix.map_lever[:3], -rotation @ fix.map_lever[3:]
     shared = lever @ fix.keyframe_covariance
     covariance = np.block(
-        [[0.5 * (own + own.T) + shared @ lever.T, shared], [shared.T, fix.keyframe_covariance]]
+        [
+            [state.beside_keyframes() + shared @ lever.T, shared],
+            [shared.T, fix.keyframe_covariance],
+        ]
     )
     expected, innovation = measured.expected_by(covariance), measured.innovation
     if innovation @ np.linalg.solve(expected, innovation) > GATE_POSE:
@@ -252,14 +248,9 @@ def _on_own_views(state: FilterState, fix: Localized, measured: Measurement) -> 
     return replace(state, covariance=covariance)
 
 
-def _is_on_map_of(state: FilterState, fix: Localized) -> bool:
-    """Whether a state considers the errors of the very keyframes that a fix rests on."""
-    return np.array_equal(state.covariance[N_OWN:, N_OWN:], fix.keyframe_covariance)
-
-
 def _with_map(state: FilterState, fix: Localized) -> FilterState:
     """Return the state with the keyframe errors of the fix's map, new ones when it changed."""
-    if _is_on_map_of(state, fix):
+    if state.considers(fix.keyframe_covariance):
         return state
     n_map = fix.map_lever.shape[1]
     covariance = np.zeros((N_OWN + n_map, N_OWN + n_map))
