@@ -203,6 +203,24 @@ def test_who_does_not_know_where_all_of_it_is_goes_on_no_less_well() -> None:
         assert np.all((told_m > 0.45) & (told_m < 0.6))
 
 
+def test_a_lost_frame_does_not_wait_for_long() -> None:
+    """Nobody makes the local map; the loop's time is all that passes."""
+
+    async def scenario() -> None:
+        _, templates = chart()
+        odometry, work = keeping()
+        truth = truth_at(0.0)
+        image = photograph(truth, np.random.default_rng(1))
+        where = Prior(truth, np.diag(np.repeat([0.01, 0.001], 3) ** 2))
+        fix = follow(image, PINHOLE, MOUNTING, templates, where, None, OPTIONS)
+        assert isinstance(fix, Localized)
+        odometry.note(Frame(image, 0, 0, 0), replace(fix, covered=0.8), templates, WORLD)
+        assert await odometry.begun(WORLD) is None
+        work.end()
+
+    run(scenario())
+
+
 def test_frames_of_another_world_begin_nothing() -> None:
     async def scenario() -> None:
         _, templates = chart()

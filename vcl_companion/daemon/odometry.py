@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +46,8 @@ _HARDLY_COVERED, _CLEARLY_SURER = 0.4, 0.8
 # And not where own frames tell how it is turned so many times better: few patches of the map that
 # lie close together tell neither, and are soon wrong.
 _TURNED_SURER = 8.0
+# A frame that has been lost waits no longer for a local map; the next ones have it.
+_BEGUN_WITHIN_S = 0.5
 # Landmarks of a map by which it is told how far its scene is.
 _N_FOR_DEPTH = 2000
 
@@ -101,7 +104,8 @@ class Odometry:
             self._begun_with = newest
             self._idle.clear()
             self._wanted.set()
-            await self.settled()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self.settled(), _BEGUN_WITHIN_S)
         return self.templates
 
     def may_tell_more(self, on_map: Localized | NotLocalized) -> bool:
