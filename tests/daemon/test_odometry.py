@@ -113,8 +113,7 @@ async def flown(
         image = photograph(truth_at(at_s), rng)
         attitude = truth_at(at_s).rotation @ exp_so3(0.005 * rng.standard_normal(3))
         predicted = estimator.predicted(at_ns, attitude)
-        keyframes = index.uncertainty.keyframe_covariance
-        priors = predicted.priors_on(keyframes) if predicted else (None,)
+        priors = predicted.priors_on_own_views() if predicted else (None,)
         given = image, PINHOLE, MOUNTING
         fix, seen = localize(*given, index, templates, priors[0], attitude, options), templates
         if hidden[0] <= at_s < hidden[1]:
@@ -123,7 +122,7 @@ async def flown(
         if goes_on and local is None and isinstance(fix, NotLocalized):
             local = await odometry.begun(WORLD)
         if goes_on and local is not None and predicted and odometry.may_tell_more(fix):
-            own = follow(*given, local, predicted.priors_on(None)[0], attitude, options)
+            own = follow(*given, local, predicted.priors_on_own_views()[0], attitude, options)
             if isinstance(own, Localized) and odometry.tells_more(own, fix):
                 fix, seen = replace(own, by="odometry"), local
         state: FilterState | NotLocalized | None = None

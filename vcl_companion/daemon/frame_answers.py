@@ -177,8 +177,7 @@ class FrameAnswers:
         )
         stored, seen = self._maps.current, None
         if stored is not None and state is not None and stored.templates is not None:
-            prior, *_ = state.priors_on(stored.index.uncertainty.keyframe_covariance)
-            seen = await self._work.seen(np.asarray(frame.image), stored, prior)
+            seen = await self._work.seen(np.asarray(frame.image), stored, state.prior())
         return FrameAnswer(
             drone_id=self._system_id,
             request_id=request_id,

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.estimator import Estimator
@@ -17,7 +15,7 @@ from vcl_companion.daemon.odometry import Odometry
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.localization.filter_state import FilterState
-from vcl_companion.localization.fix import Localized, NotLocalized, Prior
+from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.localization.pipeline import (
     Effort,
     PipelineOptions,
@@ -27,8 +25,6 @@ from vcl_companion.localization.pipeline import (
 )
 from vcl_companion.mapping.templates import Templates
 from vcl_companion.recording.sensor import Sensor
-
-_Prior = TypeVar("_Prior")
 
 # How long an attitude sample may still be on its way when its frame is here.
 ATTITUDE_WAIT_S = 0.1
@@ -132,15 +128,21 @@ class OwnFixes:
         predicted = self._estimator.predicted(at_ns, ned_from_body)
         if predicted is None:
             return None
-        options = self._options.by_heading(self._estimator.has_heading)
-
-        def follow_from(prior: Prior) -> Localized | NotLocalized:
-            return follow(
-                frame.image, self._sensor.camera, self._sensor.body_from_cam, local, prior,
-                ned_from_body, options,
-            )  # fmt: skip
-
-        own = await self._first_found(follow_from, predicted.priors_on(None))
+        own: Localized | NotLocalized = NotLocalized("not looked for")
+        for prior in predicted.priors_on_own_views():
+            own = await asyncio.get_running_loop().run_in_executor(
+                self._executor,
+                follow,
+                frame.image,
+                self._sensor.camera,
+                self._sensor.body_from_cam,
+                local,
+                prior,
+                ned_from_body,
+                self._options.by_heading(self._estimator.has_heading),
+            )
+            if isinstance(own, Localized):
+                break
         if isinstance(own, NotLocalized) or not self._odometry.tells_more(own, on_map.fix):
             return None
         if self._maps.has_left_world(on_map.stored.world):
@@ -172,31 +174,19 @@ class OwnFixes:
     ) -> Localized | NotLocalized:
         """Return what a frame gives from where the drone is believed to have been then."""
         predicted = self._estimator.predicted(frame.captured_at_ns, ned_from_body)
-        effort = replace(effort, has_heading=self._estimator.has_heading)
-
-        def localize_from(prior: Prior | None) -> Localized | NotLocalized:
-            return localize(
-                frame.image, self._sensor.camera, self._sensor.body_from_cam, stored.index,
-                stored.templates, prior, ned_from_body, self._options, effort,
-            )  # fmt: skip
-
-        priors: tuple[Prior | None, ...] = (None,)
-        if predicted is not None and stored.templates is None:
-            priors = (predicted.prior(),)
-        elif predicted is not None:
-            priors = predicted.priors_on(stored.index.uncertainty.keyframe_covariance)
-        return await self._first_found(localize_from, priors)
-
-    async def _first_found(
-        self, find: Callable[[_Prior], Localized | NotLocalized], priors: Sequence[_Prior]
-    ) -> Localized | NotLocalized:
-        """Look for a frame from each of some priors, beside the loop, until one leads to it."""
-        fix: Localized | NotLocalized = NotLocalized("nobody knows where to look")
-        for prior in priors:
-            fix = await asyncio.get_running_loop().run_in_executor(self._executor, find, prior)
-            if isinstance(fix, Localized):
-                break
-        return fix
+        return await asyncio.get_running_loop().run_in_executor(
+            self._executor,
+            localize,
+            frame.image,
+            self._sensor.camera,
+            self._sensor.body_from_cam,
+            stored.index,
+            stored.templates,
+            predicted.prior() if predicted else None,
+            ned_from_body,
+            self._options,
+            replace(effort, has_heading=self._estimator.has_heading),
+        )
 
     def note(self, frame: Frame, look: Look) -> None:
         """Remember a frame whose fix was taken: we may have to go on by it."""

@@ -96,16 +96,12 @@ class FilterState:
         """Return where the drone is expected, for guiding the matching."""
         return Prior(self.world_from_body, self.pose_covariance())
 
-    def priors_on(self, keyframe_covariance: Array | None) -> tuple[Prior, ...]:
-        """Return where the drone is expected on a map, or by views of its own; the surest first.
+    def priors_on_own_views(self) -> tuple[Prior, Prior]:
+        """Return where the drone is expected by views that were found as it was; the surer first.
 
-        Args:
-            keyframe_covariance: of that map; None for views that this state was found by, or that
-                were found as it was.
+        The other one is for where the state has been led away from them since.
         """
-        if keyframe_covariance is None or self.considers(keyframe_covariance):
-            return self._prior_among_keyframes(), self.prior()
-        return (self.prior(),)
+        return self._prior_among_keyframes(), self.prior()
 
     def considers(self, keyframe_covariance: Array) -> bool:
         """Whether these are the very keyframes whose errors are considered."""
