@@ -95,10 +95,12 @@ class _Flight:
                 await self._note(shot, replace(fix, covered=covered), self._templates)
                 is_first = False
         out: list[Localized | None] = []
-        for shot in beyond if self._odometry.templates is not None else ():
+        for shot in beyond:
             local = self._odometry.templates
-            fix = None if local is None else self._found(shot, local)
-            if fix is not None and local is not None:
+            if local is None:
+                break
+            fix = self._found(shot, local)
+            if fix is not None:
                 fix = replace(fix, by="odometry")
                 await self._note(shot, fix, local)
             out.append(fix)

@@ -67,12 +67,10 @@ def recording_report(beginnings: Sequence[Beginning]) -> dict[str, Any]:
     found = [look for look in looks if look.fix is not None]
     nees = np.array([nees_of(look) for look in found])
     is_first = np.array([look.revision == 0 for look in found], dtype=bool)
-    errors = [_position(look) for look in found]
+    alone = [look for beginning in beginnings for look in beginning.alone]
     report = {
         "instants": len(beginnings),
-        "poses": len(found),
-        "lost": len(looks) - len(found),
-        "nees_median": _median(nees),
+        **_poses(looks),
         "nees_median_first_map": _median(nees[is_first]),
         "nees_median_later": _median(nees[~is_first]),
         "nees_median_of_each": {
@@ -80,29 +78,29 @@ def recording_report(beginnings: Sequence[Beginning]) -> dict[str, Any]:
             for one in beginnings
         },
         "far_share": float(np.mean(nees > _FAR)) if found else None,
-        "within_3_sigma_share": float(np.mean([e[1] for e in errors])) if found else None,
-        "position_error_m_median": _median(np.array([e[0] for e in errors])),
         "ended": {str(one.begins): one.ended for one in beginnings if one.ended},
-        "own_frames": _own_frames([look for one in beginnings for look in one.alone]),
+        "own_frames": _poses(alone) | {"position_error_m_most": _most_m(alone)},
     }
     checked = rounded(report)
     assert isinstance(checked, dict)
     return checked
 
 
-def _own_frames(looks: list[Look]) -> dict[str, Any]:
-    """Return what poses by own frames alone come to."""
+def _poses(looks: Sequence[Look]) -> dict[str, Any]:
+    """Return what some poses come to, on maps or by own frames."""
     found = [look for look in looks if look.fix is not None]
     errors = [_position(look) for look in found]
-    off_m = np.array([e[0] for e in errors])
     return {
         "poses": len(found),
         "lost": len(looks) - len(found),
         "nees_median": _median(np.array([nees_of(look) for look in found])),
         "within_3_sigma_share": float(np.mean([e[1] for e in errors])) if found else None,
-        "position_error_m_median": _median(off_m),
-        "position_error_m_most": float(off_m.max()) if found else None,
+        "position_error_m_median": _median(np.array([e[0] for e in errors])),
     }
+
+
+def _most_m(looks: Sequence[Look]) -> float | None:
+    return max((_position(look)[0] for look in looks if look.fix is not None), default=None)
 
 
 def _position(look: Look) -> tuple[float, bool]:

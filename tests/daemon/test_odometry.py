@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import suppress
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -77,6 +78,20 @@ def keeping(shop: type[Workshop] = Workshop) -> tuple[Odometry, MapWork]:
     return Odometry(SENSOR, DRONE, work), work
 
 
+@asynccontextmanager
+async def making(shop: type[Workshop] = Workshop) -> AsyncIterator[Odometry]:
+    """Have local maps made where they are wanted."""
+    odometry, work = keeping(shop)
+    task = asyncio.create_task(odometry.run())
+    try:
+        yield odometry
+    finally:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+        work.end()
+
+
 def anywhere(index: MapIndex, templates: Templates, sigma_m: float) -> tuple[MapIndex, Templates]:
     """Return a map all of which may be somewhere else, as after a long flight."""
     landmark_map = index.landmark_map
@@ -103,42 +118,38 @@ async def flown(
     index, templates = chart()
     if vague_m:
         index, templates = anywhere(index, templates, vague_m)
-    odometry, work = keeping(shop)
-    making = asyncio.create_task(odometry.run())
     options = replace(OPTIONS, drone_id=DRONE)
     estimator = Estimator(MOTION, OPTIONS.localization, lambda _: None)
     out = []
-    for k in range(round(LENGTH_S * PER_S)):
-        at_s, at_ns = k / PER_S, round(k / PER_S * 1e9)
-        image = photograph(truth_at(at_s), rng)
-        attitude = truth_at(at_s).rotation @ exp_so3(0.005 * rng.standard_normal(3))
-        predicted = estimator.predicted(at_ns, attitude)
-        priors = predicted.priors_on_own_views() if predicted else (None,)
-        given = image, PINHOLE, MOUNTING
-        fix, seen = localize(*given, index, templates, priors[0], attitude, options), templates
-        if hidden[0] <= at_s < hidden[1]:
-            fix = NotLocalized("0 landmarks in view, 15 needed")
-        local = odometry.templates
-        if goes_on and local is None and isinstance(fix, NotLocalized):
-            local = await odometry.begun(WORLD)
-        if goes_on and local is not None and predicted and odometry.may_tell_more(fix):
-            own = follow(*given, local, predicted.priors_on_own_views()[0], attitude, options)
-            if isinstance(own, Localized) and odometry.tells_more(own, fix):
-                fix, seen = replace(own, by="odometry"), local
-        state: FilterState | NotLocalized | None = None
-        if isinstance(fix, Localized):
-            state = estimator.take_fix(predicted, fix, at_ns, attitude)
-            if isinstance(state, FilterState) and fix.by != "features":
-                odometry.note(Frame(image, at_ns, k, 0), fix, seen, WORLD)
-        else:
-            estimator.take_nothing(predicted, at_ns, attitude)
-        await odometry.settled()  # here, where no time passes, before the next frame
-        believed = state if isinstance(state, FilterState) else None
-        out.append(Flown(at_s, fix, believed, odometry.templates is not None))
-    making.cancel()
-    with suppress(asyncio.CancelledError):
-        await making
-    work.end()
+    async with making(shop) as odometry:
+        for k in range(round(LENGTH_S * PER_S)):
+            at_s, at_ns = k / PER_S, round(k / PER_S * 1e9)
+            image = photograph(truth_at(at_s), rng)
+            attitude = truth_at(at_s).rotation @ exp_so3(0.005 * rng.standard_normal(3))
+            predicted = estimator.predicted(at_ns, attitude)
+            # On the map, too; daemons look there from ``prior()``, and half a metre off lose it.
+            prior = predicted.priors_on_own_views()[0] if predicted else None
+            given = image, PINHOLE, MOUNTING
+            fix, seen = localize(*given, index, templates, prior, attitude, options), templates
+            if hidden[0] <= at_s < hidden[1]:
+                fix = NotLocalized("0 landmarks in view, 15 needed")
+            local = odometry.templates
+            if goes_on and local is None and isinstance(fix, NotLocalized):
+                local = await odometry.begun(WORLD)
+            if goes_on and local is not None and prior is not None and odometry.may_tell_more(fix):
+                own = follow(*given, local, prior, attitude, options)
+                if isinstance(own, Localized) and odometry.tells_more(own, fix):
+                    fix, seen = replace(own, by="odometry"), local
+            state: FilterState | NotLocalized | None = None
+            if isinstance(fix, Localized):
+                state = estimator.take_fix(predicted, fix, at_ns, attitude)
+                if isinstance(state, FilterState) and fix.by != "features":
+                    odometry.note(Frame(image, at_ns, k, 0), fix, seen, WORLD)
+            else:
+                estimator.take_nothing(predicted, at_ns, attitude)
+            await odometry.settled()  # here, where no time passes, before the next frame
+            believed = state if isinstance(state, FilterState) else None
+            out.append(Flown(at_s, fix, believed, odometry.templates is not None))
     return out
 
 
@@ -223,25 +234,20 @@ def test_a_lost_frame_does_not_wait_for_long() -> None:
 def test_frames_of_another_world_begin_nothing() -> None:
     async def scenario() -> None:
         _, templates = chart()
-        odometry, work = keeping()
-        making = asyncio.create_task(odometry.run())
-        assert await odometry.begun(WORLD) is None  # nor does none
-        for k in range(5):
-            truth = truth_at(1.0 + 0.3 * k)
-            image = photograph(truth, np.random.default_rng(k))
-            where = Prior(truth, np.diag(np.repeat([0.01, 0.001], 3) ** 2))
-            fix = follow(image, PINHOLE, MOUNTING, templates, where, None, OPTIONS)
-            assert isinstance(fix, Localized)
-            told = replace(fix, covered=0.8)
-            odometry.note(Frame(image, k * 10**8, k, 0), told, templates, WORLD)
-        assert await odometry.begun((b"world", 1)) is None
-        assert await odometry.begun((b"another", 0)) is None
-        assert odometry.templates is None
-        assert await odometry.begun(WORLD) is odometry.templates is not None
-        making.cancel()
-        with suppress(asyncio.CancelledError):
-            await making
-        work.end()
+        async with making() as odometry:
+            assert await odometry.begun(WORLD) is None  # nor does none
+            for k in range(5):
+                truth = truth_at(1.0 + 0.3 * k)
+                image = photograph(truth, np.random.default_rng(k))
+                where = Prior(truth, np.diag(np.repeat([0.01, 0.001], 3) ** 2))
+                fix = follow(image, PINHOLE, MOUNTING, templates, where, None, OPTIONS)
+                assert isinstance(fix, Localized)
+                told = replace(fix, covered=0.8)
+                odometry.note(Frame(image, k * 10**8, k, 0), told, templates, WORLD)
+            assert await odometry.begun((b"world", 1)) is None
+            assert await odometry.begun((b"another", 0)) is None
+            assert odometry.templates is None
+            assert await odometry.begun(WORLD) is odometry.templates is not None
 
     run(scenario())
 
@@ -257,27 +263,22 @@ def test_where_no_local_map_can_be_made_it_flies_on_by_the_map() -> None:
 def test_a_new_map_that_shows_little_of_the_place_ends_no_odometry() -> None:
     async def scenario() -> None:
         _, templates = chart()
-        odometry, work = keeping()
-        making = asyncio.create_task(odometry.run())
-        small = np.diag(np.repeat([0.01, 0.001], 3) ** 2)
-        another = templates.uncertainty.keyframe_covariance.copy()
-        for k, (covered, is_kept) in enumerate(
-            [(0.8, False), (0.6, False), (0.5, True), (0.5, True), (0.2, True), (0.75, False)]
-        ):
-            truth = truth_at(1.5 + 0.3 * k)
-            image = photograph(truth, np.random.default_rng(k))
-            where = Prior(truth, small)
-            fix = follow(image, PINHOLE, MOUNTING, templates, where, None, OPTIONS)
-            assert isinstance(fix, Localized)
-            keyframes = another if k >= 4 else fix.keyframe_covariance
-            told = replace(fix, covered=covered, keyframe_covariance=keyframes)
-            odometry.note(Frame(image, k * 10**8, k, 0), told, templates, (b"world", 0))
-            await odometry.settled()
-            assert (odometry.templates is not None) == is_kept, k
-        making.cancel()
-        with suppress(asyncio.CancelledError):
-            await making
-        work.end()
+        async with making() as odometry:
+            small = np.diag(np.repeat([0.01, 0.001], 3) ** 2)
+            another = templates.uncertainty.keyframe_covariance.copy()
+            for k, (covered, is_kept) in enumerate(
+                [(0.8, False), (0.6, False), (0.5, True), (0.5, True), (0.2, True), (0.75, False)]
+            ):
+                truth = truth_at(1.5 + 0.3 * k)
+                image = photograph(truth, np.random.default_rng(k))
+                where = Prior(truth, small)
+                fix = follow(image, PINHOLE, MOUNTING, templates, where, None, OPTIONS)
+                assert isinstance(fix, Localized)
+                keyframes = another if k >= 4 else fix.keyframe_covariance
+                told = replace(fix, covered=covered, keyframe_covariance=keyframes)
+                odometry.note(Frame(image, k * 10**8, k, 0), told, templates, (b"world", 0))
+                await odometry.settled()
+                assert (odometry.templates is not None) == is_kept, k
 
     run(scenario())
 

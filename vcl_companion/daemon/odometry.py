@@ -102,8 +102,7 @@ class Odometry:
             return None
         if self._local is None and newest is not self._begun_with:
             self._begun_with = newest
-            self._idle.clear()
-            self._wanted.set()
+            self._want()
             with suppress(TimeoutError):
                 await asyncio.wait_for(self.settled(), _BEGUN_WITHIN_S)
         return self.templates
@@ -144,8 +143,7 @@ class Odometry:
         most = max(fix.covered, most if by is fix.keyframe_covariance else _OF_MOST * most)
         self._most_covered = fix.keyframe_covariance, most
         if fix.covered < min(_COVERED, _OF_MOST * most):
-            self._idle.clear()
-            self._wanted.set()
+            self._want()
         elif fix.is_on_map:
             self._local = None
 
@@ -161,6 +159,10 @@ class Odometry:
     async def settled(self) -> None:
         """Wait until no local map is wanted that has not been made, or cannot be."""
         await self._idle.wait()
+
+    def _want(self) -> None:
+        self._idle.clear()
+        self._wanted.set()
 
     async def _make(self) -> None:
         window, scene, world = self._window, self._scene, self._world

@@ -99,24 +99,18 @@ class FilterState:
     def priors_on_own_views(self) -> tuple[Prior, Prior]:
         """Return where the drone is expected by views that were found as it was; the surer first.
 
-        The other one is for where the state has been led away from them since.
+        What their keyframes are off, the state is off as well: that makes it no less certain where
+        they show things. After a minute's flight it is most of what it is off. The other one is
+        for where the state has been led away from them since.
         """
-        return self._prior_among_keyframes(), self.prior()
+        whole, to_pose = self.prior(), self.to_pose()[:, :N_OWN]
+        own = to_pose @ self.beside_keyframes() @ to_pose.T + self.own_map_covariance
+        among = own + _UNLIKE**2 * (whole.covariance - own)
+        return Prior(self.world_from_body, np.asarray(0.5 * (among + among.T))), whole
 
     def considers(self, keyframe_covariance: Array) -> bool:
         """Whether these are the very keyframes whose errors are considered."""
         return np.array_equal(self.covariance[N_OWN:, N_OWN:], keyframe_covariance)
-
-    def _prior_among_keyframes(self) -> Prior:
-        """Return where the drone is expected to be seen from, by keyframes that err as it does.
-
-        What these are off, the state is off as well: that makes it no less certain where they
-        show things. After a minute's flight it is most of what it is off.
-        """
-        to_pose = self.to_pose()[:, :N_OWN]
-        own = to_pose @ self.beside_keyframes() @ to_pose.T + self.own_map_covariance
-        covariance = own + _UNLIKE**2 * (self.pose_covariance() - own)
-        return Prior(self.world_from_body, np.asarray(0.5 * (covariance + covariance.T)))
 
     def beside_keyframes(self) -> Array:
         """Return (12, 12) of the error state were the keyframes' errors known."""
