@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.checks import assert_consistent, assert_pose_close, nees, numeric_jacobian
+from tests.checks import assert_consistent, assert_pose_close, numeric_jacobian
+from tests.localization.filter_flights import (
+    FIX_SIGMA,
+    STEADY,
+    STEP_NS,
+    filtered,
+    fix_at,
+    fly,
+    keyframe_errors,
+    lever_in,
+    noisy,
+    updated,
+)
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, matrix_from_euler
 from vcl_companion.geometry.similarity import Similarity
@@ -23,108 +34,6 @@ from vcl_companion.localization.pose_filter import (
     started,
     update,
 )
-
-NO_MAP_ERROR = np.zeros((12, 12))
-NO_LEVER = np.zeros((6, 12))
-STEP_NS = 200_000_000
-STEP_S = 0.2
-FIX_SIGMA = np.array([0.05, 0.03, 0.04, 0.004, 0.003, 0.005])
-# Attitude offsets that neither drift nor grow by turning: what the simulation does.
-STEADY = FilterOptions(acceleration_m_s2=1.0, attitude_drift_deg_s=1e-6, attitude_turn_error=0.0)
-
-
-def fix_at(
-    pose: Pose,
-    sigma: Array = FIX_SIGMA,
-    *,
-    lever: Array = NO_LEVER,
-    keyframe_covariance: Array = NO_MAP_ERROR,
-    own_map_covariance: Array | None = None,
-) -> Localized:
-    own = np.zeros((6, 6)) if own_map_covariance is None else own_map_covariance
-    return Localized(pose, np.diag(sigma**2), own, lever, keyframe_covariance, 100, 90, True, 0.5)
-
-
-def updated(predicted: FilterState | None, fix: Localized) -> FilterState:
-    assert predicted is not None
-    state = update(predicted, fix)
-    assert isinstance(state, FilterState), state
-    return state
-
-
-@dataclass(frozen=True, eq=False)
-class Flight:
-    """True poses every 0.2 s, and attitude as the autopilot tells it.
-
-    Attributes:
-        poses: K world_from_body.
-        velocity_world: (K, 3) m/s.
-        attitudes: K (3, 3) ned_from_body as measured, or None.
-    """
-
-    poses: list[Pose]
-    velocity_world: Array
-    attitudes: list[Array | None]
-
-
-def fly(
-    rng: np.random.Generator,
-    n: int,
-    options: FilterOptions,
-    *,
-    speed_m_s: float = 1.0,
-    attitude: bool = True,
-    turn_rad_s: float = 0.4,
-    step_s: float = STEP_S,
-    held_from: int | None = None,
-) -> Flight:
-    """Move and measure exactly as the filter believes: white acceleration, biased attitude.
-
-    From frame ``held_from`` on, where fixes end, the acceleration stays what it is.
-    """
-    position, velocity = rng.standard_normal(3), speed_m_s * rng.standard_normal(3)
-    rotation = matrix_from_euler(*(0.3 * rng.standard_normal(3)))
-    rate = turn_rad_s * rng.standard_normal(3)
-    ned_from_world = matrix_from_euler(0.01, -0.02, 1.5)
-    sigma = np.deg2rad(options.attitude_sigma_deg)
-    poses, velocities, attitudes = [], [], []
-    shove = np.zeros(3)
-    for k in range(n):
-        poses.append(Pose(rotation, position))
-        velocities.append(velocity)
-        sample = ned_from_world @ rotation @ exp_so3(sigma * rng.standard_normal(3))
-        attitudes.append(sample if attitude else None)
-        if held_from is None or k <= held_from:
-            shove = options.acceleration_m_s2 * rng.standard_normal(3)
-        position = position + velocity * step_s + 0.5 * shove * step_s**2
-        velocity = velocity + shove * step_s
-        turned = rate * step_s
-        if not attitude:
-            turned = np.deg2rad(options.turn_rate_deg_s) * step_s * rng.standard_normal(3)
-        rotation = rotation @ exp_so3(turned)
-    return Flight(poses, np.array(velocities), attitudes)
-
-
-def filtered(
-    flight: Flight,
-    fix_of: Callable[[Pose], Localized],
-    options: FilterOptions,
-    step_ns: int = STEP_NS,
-) -> list[FilterState]:
-    state = started(fix_of(flight.poses[0]), 0, flight.attitudes[0], options)
-    states = [state]
-    for k in range(1, len(flight.poses)):
-        predicted = predict(state, k * step_ns, flight.attitudes[k], options)
-        assert predicted is not None
-        after = update(predicted, fix_of(flight.poses[k]))
-        # One honest fix in ten thousand is refused by bad luck.
-        state = predicted if isinstance(after, NotLocalized) else after
-        states.append(state)
-    return states
-
-
-def noisy(rng: np.random.Generator, sigma: Array = FIX_SIGMA) -> Callable[[Pose], Localized]:
-    return lambda pose: fix_at(pose.retracted(sigma * rng.standard_normal(6)), sigma)
 
 
 @pytest.mark.parametrize("attitude", [True, False])
@@ -215,109 +124,6 @@ def test_a_prediction_is_as_uncertain_in_one_step_as_in_many(attitude: bool) -> 
     assert np.all(sigma[:3] > 0.49 * options.acceleration_m_s2)
     yaw = 0.02 * np.pi / 2 if attitude else np.deg2rad(options.turn_rate_deg_s)
     assert 0.98 * yaw < sigma[5] < 1.3 * yaw
-
-
-def keyframe_errors(rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return the (12, 12) covariance of two keyframes, the first one held, and a draw of it."""
-    factor = np.zeros((12, 12))
-    factor[6:, 6:] = np.diag([0.2] * 3 + [0.01] * 3) @ (np.eye(6) + 0.3 * rng.random((6, 6)))
-    return factor @ factor.T, factor @ rng.standard_normal(12)
-
-
-def lever_in(pose: Pose) -> Array:
-    """Return a (6, 12) lever that says: the whole map sits where its second keyframe claims.
-
-    The same world error seen from every pose; in local axes it turns with the body.
-    """
-    out = np.zeros((6, 12))
-    out[:3, 6:9] = out[3:, 9:] = pose.rotation.T
-    return out
-
-
-TINY = 0.2 * FIX_SIGMA
-
-
-def on_maps_that_err(
-    rng: np.random.Generator, n_frames: int
-) -> Iterator[tuple[Array, Flight, Callable[[Pose], Localized]]]:
-    """Yield sixty flights: the covariance of what keyframes are off, and what fixes they give."""
-    for _ in range(60):
-        covariance, draw = keyframe_errors(rng)
-
-        def fix_of(pose: Pose, covariance: Array = covariance, draw: Array = draw) -> Localized:
-            found = pose.retracted(lever_in(pose) @ draw)
-            found = found.retracted(TINY * rng.standard_normal(6))
-            return fix_at(found, TINY, lever=lever_in(found), keyframe_covariance=covariance)
-
-        yield covariance, fly(rng, n_frames, STEADY), fix_of
-
-
-def test_the_map_s_error_is_common_to_all_frames_and_does_not_average_out() -> None:
-    errors, sigma, shares = [], [], []
-    for covariance, flight, fix_of in on_maps_that_err(np.random.default_rng(4), 40):
-        state = filtered(flight, fix_of, STEADY)[-1]
-        errors.append(state.world_from_body.local(flight.poses[-1]))
-        sigma.append(state.pose_covariance())
-        lever = lever_in(flight.poses[-1])
-        shares.append(np.trace(sigma[-1]) / np.trace(lever @ covariance @ lever.T))
-    assert_consistent(errors, sigma)
-    # Forty frames later the map's error is still all there, and the noise nearly gone.
-    assert min(shares) > 0.999
-    assert max(shares) < 1.05
-
-
-def test_where_a_map_shows_things_is_no_less_certain_for_what_it_is_off() -> None:
-    """Predictions against what the map says next: sharp, though both are off by decimetres."""
-    missed, among, whole = [], [], []
-    for _, flight, fix_of in on_maps_that_err(np.random.default_rng(14), 20):
-        before = filtered(replace(flight, poses=flight.poses[:-1]), fix_of, STEADY)[-1]
-        predicted = predict(before, before.at_ns + STEP_NS, flight.attitudes[-1], STEADY)
-        assert predicted is not None
-        surest, surely = (prior.covariance for prior in predicted.priors_on_own_views())
-        missed.append(predicted.world_from_body.local(fix_of(flight.poses[-1]).world_from_body))
-        among.append(surest + np.diag(TINY**2))
-        whole.append(surely + np.diag(TINY**2))
-    # Of six degrees of freedom.
-    assert 3.0 < np.mean(nees(missed, among)) < 8.0
-    assert np.mean(nees(missed, whole)) < 2.0
-
-
-def test_a_new_map_s_error_is_a_new_one() -> None:
-    rng = np.random.default_rng(5)
-    pose = Pose.identity()
-    covariance, _ = keyframe_errors(rng)
-    first = fix_at(pose, lever=lever_in(pose), keyframe_covariance=covariance)
-    state = started(first, 0, np.eye(3), STEADY)
-    before = np.trace(state.pose_covariance())
-    larger = np.zeros((18, 18))
-    larger[6:, 6:] = np.diag([0.04] * 3 + [1e-4] * 3 + [0.04] * 3 + [1e-4] * 3)
-    lever = np.hstack([lever_in(pose), np.zeros((6, 6))])
-    second = fix_at(pose, lever=lever, keyframe_covariance=larger)
-    after = updated(predict(state, STEP_NS, np.eye(3), STEADY), second)
-    assert after.covariance.shape == (30, 30)
-    np.testing.assert_array_equal(after.covariance[12:, 12:], larger)
-    # Two maps with independent errors know more than one.
-    assert np.trace(after.pose_covariance()) < before
-
-
-def test_the_landmarks_own_errors_are_part_of_what_is_told() -> None:
-    own = np.diag([0.01] * 3 + [1e-4] * 3)
-    state = started(fix_at(Pose.identity(), own_map_covariance=own), 0, np.eye(3), STEADY)
-    for k in range(1, 50):
-        predicted = predict(state, k * STEP_NS, np.eye(3), STEADY)
-        state = updated(predicted, fix_at(Pose.identity(), own_map_covariance=own))
-    assert np.all(np.linalg.eigvalsh(state.pose_covariance() - own) > 0)
-    # In body axes: it turns with the body.
-    turned = predict(state, 51 * STEP_NS, exp_so3(np.array([0.0, 0.0, np.pi / 2])), STEADY)
-    assert turned is not None
-    np.testing.assert_allclose(np.diag(turned.own_map_covariance), np.diag(own), atol=1e-12)
-    uneven = np.diag([0.04, 0.01, 0.01, 1e-4, 1e-4, 1e-4])
-    state = started(fix_at(Pose.identity(), own_map_covariance=uneven), 0, np.eye(3), STEADY)
-    turned = predict(state, STEP_NS, exp_so3(np.array([0.0, 0.0, np.pi / 2])), STEADY)
-    assert turned is not None
-    np.testing.assert_allclose(
-        np.diag(turned.own_map_covariance)[:3], [0.01, 0.04, 0.01], atol=1e-12
-    )
 
 
 def test_a_first_fix_is_told_as_sure_as_it_is() -> None:
@@ -682,51 +488,3 @@ def test_options_must_be_positive(name: str) -> None:
         FilterOptions(**{name: 0.0})
     with pytest.raises(ValueError, match="attitude_turn_error must lie in"):
         FilterOptions(attitude_turn_error=1.0)
-
-
-def test_maps_of_own_views_are_no_witnesses_of_where_they_are() -> None:
-    """A drone goes on from one to the next: it errs as they do, no less for how many they are."""
-    known = np.zeros((12, 12))
-    known[6:, 6:] = np.diag([0.2**2] * 3 + [0.01**2] * 3)
-    lever = np.hstack([np.zeros((6, 6)), np.eye(6)])
-    sharp = np.repeat([0.003, 0.0005], 3)
-    pose, velocity = Pose.identity(), np.array([2.0, -1.0, 0.0])
-    first = fix_at(pose, sharp, lever=lever, keyframe_covariance=known)
-    state = started(first, 0, pose.rotation, STEADY)
-    for k in range(1, 41):
-        pose = Pose(np.eye(3), k * STEP_S * velocity)
-        # Another map each time: of one's own views it is as vague as the last one.
-        keyframes = known * (1.0 + 1e-9 * k)
-        fix = fix_at(pose, sharp, lever=lever, keyframe_covariance=keyframes)
-        predicted = predict(state, k * STEP_NS, pose.rotation, STEADY)
-        state = updated(predicted, replace(fix, by="odometry"))
-    sigma_m = np.sqrt(np.diag(state.pose_covariance())[:3])
-    assert np.all(np.abs(sigma_m - 0.2) < 0.005)
-    # Frame by frame these err alike, so that how fast it flies is known all the same.
-    np.testing.assert_allclose(state.velocity_world, velocity, atol=0.05)
-    assert np.all(np.sqrt(np.diag(state.velocity_covariance())) < 0.2)
-
-
-def test_a_map_of_own_views_is_followed_where_the_state_knows_better() -> None:
-    """Found by the swarm's map again for a moment, then on by own views that have drifted."""
-    surer = np.zeros((12, 12))
-    surer[6:, 6:] = np.diag([0.01**2] * 3 + [0.001**2] * 3)
-    vague = np.zeros((12, 12))
-    vague[6:, 6:] = np.diag([0.3**2] * 3 + [0.002**2] * 3)
-    lever = np.hstack([np.zeros((6, 6)), np.eye(6)])
-    sharp = np.repeat([0.003, 0.0005], 3)
-    velocity = np.array([2.0, -1.0, 0.0])
-    on_map = fix_at(Pose.identity(), sharp, lever=lever, keyframe_covariance=surer)
-    state = started(on_map, 0, np.eye(3), STEADY)
-    for k in range(1, 8):
-        pose = Pose(np.eye(3), k * STEP_S * velocity)
-        fix = fix_at(pose, sharp, lever=lever, keyframe_covariance=surer)
-        state = updated(predict(state, k * STEP_NS, np.eye(3), STEADY), fix)
-    drifted = Pose(np.eye(3), 8 * STEP_S * velocity + np.array([0.3, 0.2, 0.0]))
-    own = replace(fix_at(drifted, sharp, lever=lever, keyframe_covariance=vague), by="odometry")
-    after = updated(predict(state, 8 * STEP_NS, np.eye(3), STEADY), own)
-    assert after.n_jumps == state.n_jumps
-    assert_pose_close(after.world_from_body, drifted, within_m=0.02, within_rad=0.01)
-    assert np.all(np.sqrt(np.diag(after.pose_covariance())[:3]) > 0.25)
-    np.testing.assert_allclose(after.velocity_world, velocity, atol=0.05)
-    assert np.all(np.sqrt(np.diag(after.velocity_covariance())) < 0.5)

@@ -14,7 +14,6 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, log_so3
 from vcl_companion.localization.contradictions import reconciled
 from vcl_companion.localization.filter_state import (
-    GATE_POSE,
     N_OWN,
     OFFSET,
     POSITION,
@@ -23,14 +22,12 @@ from vcl_companion.localization.filter_state import (
     FilterState,
     Measurement,
     kalman_step,
-    unknown,
 )
 from vcl_companion.localization.fix import Localized, NotLocalized
+from vcl_companion.localization.other_keyframes import on_own_views, on_revision, with_keyframes
 from vcl_companion.options import require_positive
 
 _MAX_COAST_S = 60.0
-# Where nothing is known of a position, 1 sigma.
-_ANYWHERE_M = 1e3
 
 
 @dataclass(frozen=True)
@@ -173,17 +170,20 @@ def update(predicted: FilterState, fix: Localized) -> FilterState | NotLocalized
     (``contradictions``).
     """
     before = predicted
-    predicted = _with_map(before, fix)
+    predicted = with_keyframes(before, fix)
     measured = Measurement(
         predicted.world_from_body.local(fix.world_from_body),
         _observation(predicted, fix),
         fix.noise_covariance + fix.own_map_covariance,
     )
-    if not (fix.is_on_map or before.considers(fix.keyframe_covariance)):
-        predicted = _on_own_views(before, fix, measured)
+    is_another = not before.considers(fix.keyframe_covariance)
+    if is_another and not fix.is_on_map:
+        predicted = on_own_views(before, fix, measured)
     believed = reconciled(predicted, fix, measured)
     if isinstance(believed, NotLocalized):
         return believed
+    if is_another and fix.is_on_map and believed.n_jumps == before.n_jumps:
+        believed = on_revision(believed, fix, measured)
     step, covariance = kalman_step(believed.covariance, measured)
     return believed.corrected(step, covariance, fix.own_map_covariance)
 
@@ -223,37 +223,3 @@ def _observation(predicted: FilterState, fix: Localized) -> Array:
     out[:3, N_OWN:] = turned @ fix.map_lever[:3]
     out[3:, N_OWN:] = turned @ fix.map_lever[3:]
     return out
-
-
-def _on_own_views(state: FilterState, fix: Localized, measured: Measurement) -> FilterState:
-    """Return a state that goes on with a new map of our own views.
-
-    What that knows of where it is it has from the state that those views were found by: it is no
-    second witness, and errs as the state does, but for what has come since. Where the state has
-    learnt better meanwhile, which the fix then contradicts, only its speed is kept.
-    """
-    lever = np.zeros((N_OWN, fix.map_lever.shape[1]))
-    rotation = state.world_from_body.rotation
-    lever[POSITION], lever[OFFSET] = -rotation @ fix.map_lever[:3], -rotation @ fix.map_lever[3:]
-    shared = lever @ fix.keyframe_covariance
-    covariance = np.block(
-        [
-            [state.beside_keyframes() + shared @ lever.T, shared],
-            [shared.T, fix.keyframe_covariance],
-        ]
-    )
-    expected, innovation = measured.expected_by(covariance), measured.innovation
-    if innovation @ np.linalg.solve(expected, innovation) > GATE_POSE:
-        covariance = unknown(covariance, ((POSITION, _ANYWHERE_M), (OFFSET, np.pi)))
-    return replace(state, covariance=covariance)
-
-
-def _with_map(state: FilterState, fix: Localized) -> FilterState:
-    """Return the state with the keyframe errors of the fix's map, new ones when it changed."""
-    if state.considers(fix.keyframe_covariance):
-        return state
-    n_map = fix.map_lever.shape[1]
-    covariance = np.zeros((N_OWN + n_map, N_OWN + n_map))
-    covariance[:N_OWN, :N_OWN] = state.covariance[:N_OWN, :N_OWN]
-    covariance[N_OWN:, N_OWN:] = fix.keyframe_covariance
-    return replace(state, covariance=covariance)
