@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from tests.daemon import demo
 from tests.daemon.test_companion import DRONE, Flight, flying
 from tests.daemon.waiting import run, until
 from vcl_companion.daemon.frame_choice import FrameChoice
+from vcl_companion.localization.filter_state import FilterState
 
 FOUND, LOST = (0, 1), (2, 3, 4)
 
@@ -73,6 +75,26 @@ def test_a_map_is_extended_by_the_last_frame_that_was_found(tmp_path: Path) -> N
                 frame = await chosen(up).of(at_ns(k))
                 assert frame is not None
                 assert frame.captured_at_ns == at_ns(k)
+
+    run(scenario())
+
+
+@pytest.mark.parametrize(("n_inliers", "extended_by"), [(30, FOUND[-1]), (60, LOST[0])])
+def test_a_map_is_not_extended_by_a_frame_that_shows_little_of_it(
+    tmp_path: Path, n_inliers: int, extended_by: int
+) -> None:
+    async def scenario() -> None:
+        async with lost(tmp_path) as up:
+            well = up.estimator.fix_at(at_ns(FOUND[-1]))
+            assert well is not None
+            assert well.shows_well
+            there = demo.world_from_body(DRONE, LOST[0])
+            fix = replace(well, world_from_body=there, n_inliers=n_inliers)
+            taken = up.estimator.take_fix(None, fix, at_ns(LOST[0]), None)
+            assert isinstance(taken, FilterState)
+            frame = await chosen(up).of(at_ns(LOST[-1]))
+            assert frame is not None
+            assert frame.captured_at_ns == at_ns(extended_by)
 
     run(scenario())
 

@@ -148,7 +148,7 @@ def target_of(
 ) -> InterTarget:
     """The target's side of inter-MAV localization, with peers on the map who never answer."""
     group = Group(SwarmOptions((*peers, DRONE)), DRONE)
-    well = MapState(revision_of(demo.encoded_map(1, 2, 3)), 100, True)
+    well = MapState(revision_of(demo.encoded_map(1, 2, 3)), 100, True, tracked=80)
     group.set_own_state(well)
     for peer in peers:
         group.map_state(peer, well, 0.0)

@@ -164,7 +164,7 @@ async def asked_by(members: Swarm, system_id: int) -> tuple[Drone, Stranger]:
     drone = await members.start(system_id, MAP, inter=replace(PATIENT, max_hosts=1))
     stranger = await members.stranger(1)
     await stranger.meets(system_id)
-    stranger.say(MapState(drone.revision, 9, True), system_id)
+    stranger.say(MapState(drone.revision, 9, True, tracked=80), system_id)
     await knows_of(drone, 1)
     return drone, stranger
 

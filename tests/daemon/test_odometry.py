@@ -110,15 +110,18 @@ async def flown(
     shop: type[Workshop] = Workshop,
     hidden: tuple[float, float] = (0.0, 0.0),
     vague_m: float = 0.0,
+    most_m: float = OPTIONS.localization.max_sigma_m,
 ) -> list[Flown]:
     """Fly there and back; with or without going on by own frames where the map ends.
 
-    For the time ``hidden``, s, the map shows nothing. All of it may be so far off, 1 sigma.
+    For the time ``hidden``, s, the map shows nothing. All of it may be so far off, 1 sigma. Poses
+    by the map are believed if they are sure to ``most_m``.
     """
     index, templates = chart()
     if vague_m:
         index, templates = anywhere(index, templates, vague_m)
-    options = replace(OPTIONS, drone_id=DRONE)
+    belief = replace(OPTIONS.localization, max_sigma_m=most_m)
+    options = replace(OPTIONS, localization=belief, drone_id=DRONE)
     estimator = Estimator(MOTION, OPTIONS.localization, lambda _: None)
     out = []
     async with making(shop) as odometry:
@@ -137,7 +140,7 @@ async def flown(
             if goes_on and local is None and isinstance(fix, NotLocalized):
                 local = await odometry.begun(WORLD)
             if goes_on and local is not None and prior is not None and odometry.may_tell_more(fix):
-                own = follow(*given, local, prior, attitude, options)
+                own = follow(*given, local, prior, attitude, options.of_own_views())
                 if isinstance(own, Localized) and odometry.tells_more(own, fix):
                     fix, seen = replace(own, by="odometry"), local
             state: FilterState | NotLocalized | None = None
@@ -211,6 +214,20 @@ def test_who_does_not_know_where_all_of_it_is_goes_on_no_less_well() -> None:
         assert f.state is not None
         told_m = np.sqrt(np.diag(f.state.pose_covariance())[:3])
         assert np.all((told_m > 0.45) & (told_m < 0.6))
+
+
+def test_by_own_frames_it_goes_on_where_a_pose_by_the_map_would_be_too_vague() -> None:
+    """What they are off they are off alike: refused, nothing would lead back to the map."""
+    most_m = 0.02
+    frames = asyncio.run(flown(np.random.default_rng(5), goes_on=True, most_m=most_m))
+    assert all(by(f) in ("patches", "odometry") for f in frames[1:])
+    assert by(frames[-1]) == "patches"
+    told_m = [
+        np.sqrt(np.linalg.eigvalsh(f.state.pose_covariance()[:3, :3])[-1])
+        for f in frames
+        if f.state is not None and by(f) == "odometry"
+    ]
+    assert max(told_m) > 2.0 * most_m
 
 
 def test_a_lost_frame_does_not_wait_for_long() -> None:

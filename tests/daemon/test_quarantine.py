@@ -49,7 +49,7 @@ def test_a_peer_that_puts_us_elsewhere_does_not_move_us_and_is_quarantined(tmp_p
             await stranger.meets(2)
             async with flying(drone) as two:
                 for k in range(6):
-                    stranger.say(MapState(drone.revision, 9, True), 2)
+                    stranger.say(MapState(drone.revision, 9, True, tracked=80), 2)
                     await until(lambda: bool(drone.group.state_of(1)))
                     two.give(k)
                     await answered_5_m_off(stranger, k)
@@ -103,7 +103,7 @@ async def it_counts_for_nothing_but_is_told(drone: Drone, stranger: Stranger) ->
     stranger.say(FrameRequest(7, 0, 0.0), 2)
     stranger.say(MapRefused(7, "because I say so"), 2)
     await refused_as(drone, "message of a quarantined drone", 2)
-    stranger.say(MapState(drone.revision, 9, True, wants_update=True), 2)
+    stranger.say(MapState(drone.revision, 9, True, tracked=80, wants_update=True), 2)
     request = PoseRequest(drone.revision, demo.answer(1, 0, request_id=8))
     stranger.heard()
     stranger.hand(BlobKind.POSE_REQUEST, encode_pose_request(request), 2)
@@ -202,7 +202,7 @@ def test_a_newcomer_that_took_a_bent_map_follows_the_others(tmp_path: Path) -> N
             await refused_as(drone, CONTRADICTS)
             await passes(6.0)  # it is looked at again
             for stranger in (one, three):
-                stranger.say(MapState(revision_of(NEXT), 9, True), 2)
+                stranger.say(MapState(revision_of(NEXT), 9, True, tracked=80), 2)
             await until(lambda: len(drone.group.holders(revision_of(NEXT))) == 2)
             one.forget()
             one.hand(BlobKind.MAP, NEXT, 2)

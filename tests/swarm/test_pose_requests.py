@@ -18,16 +18,18 @@ SECOND = 10**9
 def group_of(*hosts: int) -> Group:
     """Drone 9 among peers 1 to 5, of which some are localized on its map."""
     group = Group(SwarmOptions((1, 2, 3, 4, 5, 9)), 9)
-    group.set_own_state(MapState(MAP, 100, True))
+    group.set_own_state(MapState(MAP, 100, True, tracked=80))
     for peer in hosts:
-        group.map_state(peer, MapState(MAP, 100, True), 0.0)
+        group.map_state(peer, MapState(MAP, 100, True, tracked=80), 0.0)
     return group
 
 
-def test_only_peers_that_are_localized_on_our_map_are_asked() -> None:
+def test_only_peers_that_see_our_map_are_asked() -> None:
     group = group_of(1, 3)
-    group.map_state(2, MapState(OTHER, 100, True), 0.0)
+    group.map_state(2, MapState(OTHER, 100, True, tracked=80), 0.0)
     group.map_state(4, MapState(MAP, 100, False), 0.0)
+    # Localized, by its own last frames.
+    group.map_state(5, MapState(MAP, 100, True, tracked=0), 0.0)
     choice = HostChoice(group)
     assert choice.choose(MAP, 5) == [1, 3]
     assert choice.choose(OTHER, 5) == [2]

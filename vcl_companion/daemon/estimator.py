@@ -135,7 +135,7 @@ class Estimator:
         self._history.clear()
         self._n_contradicted = 0
         self.last_own_fix.forget()
-        self.in_sight.shown_at_ns = None
+        self.in_sight.forget_shown()
 
     def own_fix_at(self, at_ns: int) -> FilterState | None:
         """Return what was believed at a frame that had a fix on the map; None at any other."""
@@ -274,7 +274,7 @@ class Estimator:
             self._relocalized(fix)
         self._n_contradicted = 0
         self._has_begun = True
-        self.in_sight.note_shown(at_ns)
+        self.in_sight.note_shown(at_ns, fix)
         self.last_own_fix.note(state)
         return state
 

@@ -268,7 +268,7 @@ class Exchange:
 
     def on_frame(self, frame: Frame) -> None:
         """Keep a frame of our own for peers, and for a first map."""
-        self.frames.add(frame, self._in_sight.shown_at_ns)
+        self.frames.add(frame, self._in_sight.shown_well_at_ns)
 
     def on_heartbeat(self, peer: int) -> None:
         """Note a sign of life."""

@@ -1,8 +1,8 @@
 """Which of our frames a map is extended by: that of an instant, or the last one that shows it.
 
-Who turns away faster than maps are made is lost beyond what the map shows. A frame from there
-joins nothing; the last one that was followed joins at once, and what is made of it reaches
-further (``CatchingUp``).
+Who turns away, or flies on, faster than maps are made is lost beyond what the map shows. A frame
+from there joins nothing, nor does one in which hardly anything of it is left; the last one that
+showed it well joins at once, and what is made of it reaches further (``CatchingUp``).
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ class FrameChoice:
         self._clock = clock
 
     async def of(self, at_ns: int) -> Frame | None:
-        """Return the frame nearest to an instant, or the last one before it that had a fix.
+        """Return the frame nearest to an instant, or the last one before it that joins the map.
 
-        That only if the nearest had none, and if it shows more than our keyframes in the map do:
-        where nobody moves on, it is the nearest that the map lacks.
+        That only if the nearest may not join it, and if it shows more than our keyframes in the
+        map do: where nobody moves on, it is the nearest that the map lacks.
 
         Args:
             at_ns: the instant, our clock.
@@ -65,13 +65,15 @@ class FrameChoice:
         await self._estimator.settled(until_ns, self._clock.now_ns())
         stored = self._maps.current
         since_ns = max(until_ns - FURTHEST_BACK_NS, self._shown_until_ns(stored.index.landmark_map))
-        found = (
-            frame
-            for frame in reversed(self._frames.after(since_ns))
-            if frame.captured_at_ns <= until_ns
-            and self._estimator.own_fix_at(frame.captured_at_ns) is not None
-        )
-        return next(found, nearest)
+        fixed: Frame | None = None
+        for frame in reversed(self._frames.after(since_ns)):
+            fix = self._estimator.fix_at(frame.captured_at_ns)
+            if fix is None or frame.captured_at_ns > until_ns:
+                continue
+            if fix.shows_well:
+                return frame
+            fixed = fixed or frame
+        return fixed or nearest
 
     def _shown_until_ns(self, landmark_map: LandmarkMap) -> int:
         """Return when our newest keyframe of a map was taken, and a moment; -1 without one."""

@@ -23,7 +23,7 @@ FURTHEST_NS = 1_000_000_000
 class FrameHistory:
     """Keeps about the last two seconds, and of the ten before them one a second.
 
-    Of who is beyond the map five a second, since the last fix on it.
+    Of who is beyond the map five a second, since the last one that showed it well.
     """
 
     def __init__(self) -> None:
@@ -31,18 +31,18 @@ class FrameHistory:
         self._sparse: list[Frame] = []
         self._newest: Frame | None = None
 
-    def add(self, frame: Frame, fixed_at_ns: int | None = None) -> None:
+    def add(self, frame: Frame, shown_at_ns: int | None = None) -> None:
         """Keep one more: always until the next one comes, longer unless frames come fast.
 
         Args:
             frame: not before the last one.
-            fixed_at_ns: of the last frame that had a fix on the map; None where none had.
+            shown_at_ns: of the last frame that showed the map well; None where none did.
         """
         self._newest = frame
         if self._kept and abs(frame.captured_at_ns - self._kept[-1].captured_at_ns) < _SPACING_NS:
             return
         if len(self._kept) == _N_FRAMES:
-            self._thin_out(self._kept[0], fixed_at_ns)
+            self._thin_out(self._kept[0], shown_at_ns)
         self._kept.append(frame)
 
     @property
@@ -74,13 +74,13 @@ class FrameHistory:
         """Return whether the frame of an instant is here."""
         return any(frame.captured_at_ns == at_ns for frame in self._all())
 
-    def _thin_out(self, leaving: Frame, fixed_at_ns: int | None) -> None:
+    def _thin_out(self, leaving: Frame, shown_at_ns: int | None) -> None:
         """Keep of the frames that left the dense part those that are far enough apart."""
         found: list[Frame] = []
         lost: list[Frame] = []
         for frame in (*self._sparse, leaving):
             at_ns = frame.captured_at_ns
-            is_lost = fixed_at_ns is not None and at_ns >= fixed_at_ns
+            is_lost = shown_at_ns is not None and at_ns >= shown_at_ns
             before = next(reversed(lost or found), None)
             apart_ns = _LOST_SPACING_NS if is_lost else _SPARSE_SPACING_NS
             if before is None or at_ns - before.captured_at_ns >= apart_ns:

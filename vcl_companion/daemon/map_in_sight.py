@@ -20,6 +20,7 @@ class MapInSight:
         covered: share of the last frame that they filled; 0 when it was refused.
         novelty_deg: how differently they looked there from how they are remembered, degrees.
         shown_at_ns: when the last frame was taken that showed it; None where none has.
+        shown_well_at_ns: the same of one by which it can be extended.
         seen_on: revision of the map that the last frame was looked at on.
         beyond: revision of the map that was followed as far as it shows, the last frame being
             beyond that.
@@ -32,6 +33,7 @@ class MapInSight:
         self.covered = 0.0
         self.novelty_deg = 0.0
         self.shown_at_ns: int | None = None
+        self.shown_well_at_ns: int | None = None
         self.seen_on = b""
         self.beyond = b""
         self.sought_since_s: float | None = None
@@ -45,13 +47,19 @@ class MapInSight:
         else:
             self.tracked, self.covered = fix.n_seen, fix.covered
             self.novelty_deg = fix.novelty_deg
-            self.note_shown(at_ns)
+            self.note_shown(at_ns, fix)
         self._looked_at_ns = at_ns
         self._looked.set()
 
-    def note_shown(self, at_ns: int) -> None:
-        """Note that the frame of an instant showed the map; an older one changes nothing."""
+    def note_shown(self, at_ns: int, fix: Localized) -> None:
+        """Note what the frame of an instant showed of the map; an older one changes nothing."""
         self.shown_at_ns = max(at_ns, self.shown_at_ns or 0)
+        if fix.shows_well:
+            self.shown_well_at_ns = max(at_ns, self.shown_well_at_ns or 0)
+
+    def forget_shown(self) -> None:
+        """Note that what showed the map says nothing of where it shows anything now."""
+        self.shown_at_ns = self.shown_well_at_ns = None
 
     def is_being_sought(self, now_s: float) -> bool:
         """Whether what the frames show will be known in a moment.

@@ -139,7 +139,7 @@ class OwnFixes:
                 local,
                 prior,
                 ned_from_body,
-                self._options.by_heading(self._estimator.has_heading),
+                self._options.of_own_views().by_heading(self._estimator.has_heading),
             )
             if isinstance(own, Localized):
                 break

@@ -15,6 +15,10 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, euler_from_matrix
 from vcl_companion.localization.localization_options import LocalizationOptions
 
+# With so many landmarks a frame joins the map, though some are lost as its image is encoded: no
+# single one decides where it was taken.
+_JOINS = 50
+
 Recognised = Literal["patches", "features", "odometry"]
 """What a pose rests on: the map's patches, a detector's features, or our own last frames alone."""
 
@@ -68,6 +72,11 @@ class Localized:
     def is_on_map(self) -> bool:
         """Whether it is the swarm's map that was recognised."""
         return self.by != "odometry"
+
+    @property
+    def shows_well(self) -> bool:
+        """Whether the frame shows enough of the swarm's map to extend it by."""
+        return self.is_on_map and self.n_inliers >= _JOINS
 
     def covariance(self) -> Array:
         """Return (6, 6) the whole covariance of this pose alone, local."""

@@ -23,6 +23,8 @@ class LocalizationOptions:
             seen from another side than in its keyframe, 1 sigma.
         bias_px_per_octave: the same per doubling or halving of its distance.
         max_sigma_m: a pose less certain than this in any direction is refused.
+        max_own_sigma_m: the same of a pose by the drone's own last frames, which is known among
+            these far better: refused, they could not be gone on by until the map is there.
         max_tilt_deg: roll and pitch may disagree with the autopilot's by this much.
         max_heading_deg: heading may disagree with the autopilot's by this much.
     """
@@ -35,6 +37,7 @@ class LocalizationOptions:
     bias_px_per_deg: float = 0.03
     bias_px_per_octave: float = 1.5
     max_sigma_m: float = 1.0
+    max_own_sigma_m: float = 5.0
     max_tilt_deg: float = 6.0
     max_heading_deg: float = 25.0
 
@@ -46,6 +49,7 @@ class LocalizationOptions:
             "guided_radius_px",
             "noise_floor_px",
             "max_sigma_m",
+            "max_own_sigma_m",
             "max_tilt_deg",
             "max_heading_deg",
             "bias_px_per_deg",
@@ -55,3 +59,7 @@ class LocalizationOptions:
     def of_any_heading(self) -> LocalizationOptions:
         """Return the same where the autopilot's heading says nothing of the map's north."""
         return replace(self, max_heading_deg=180.0)
+
+    def of_own_views(self) -> LocalizationOptions:
+        """Return the same for poses by the drone's own last frames."""
+        return replace(self, max_sigma_m=max(self.max_sigma_m, self.max_own_sigma_m))

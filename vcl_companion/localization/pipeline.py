@@ -55,6 +55,10 @@ class PipelineOptions:
             return self
         return replace(self, localization=self.localization.of_any_heading())
 
+    def of_own_views(self) -> PipelineOptions:
+        """Return the same for a frame that is looked at by the drone's own last ones."""
+        return replace(self, localization=self.localization.of_own_views())
+
 
 @dataclass(frozen=True, kw_only=True)
 class Effort:

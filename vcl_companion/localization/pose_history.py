@@ -41,8 +41,8 @@ class PoseHistory:
     Args:
         length_s: how far back a proposal may reach.
         options: the filter's, to apply measurements again.
-        lost_s: how far back, if that is longer, the states since the last fix are kept of
-            frames that ``has_frame``: a map that comes later may show where they were.
+        lost_s: how far back, if that is longer, the states since the map was seen well are kept
+            of frames that ``has_frame``: a map that comes later may show where they were.
 
     Attributes:
         has_frame: whether the frame of an instant is still there. A state is a tenth of a
@@ -193,13 +193,14 @@ class PoseHistory:
     def _forget_before(self, now_ns: int) -> None:
         """Let go of what is too old, but for what of it may still be found."""
         steps = self._steps
-        fixed_at_ns = next((s.state.at_ns for s in reversed(steps) if s.fix_on_map), -1)
+        shown = (s.state.at_ns for s in reversed(steps) if s.fix is not None and s.fix.shows_well)
+        shown_at_ns = next(shown, -1)
         old: list[_Step] = []
         while steps[0].state.at_ns < now_ns - self._length_ns:
             old.append(steps.popleft())
         for step in reversed(old):
             at_ns = step.state.at_ns
-            if at_ns >= max(fixed_at_ns, now_ns - self._lost_ns) and self.has_frame(at_ns):
+            if at_ns >= max(shown_at_ns, now_ns - self._lost_ns) and self.has_frame(at_ns):
                 steps.appendleft(step)
 
     def _nearest(self, at_ns: int) -> int | None:

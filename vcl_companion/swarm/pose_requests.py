@@ -158,7 +158,11 @@ class HostChoice:
         return 0.0 if told is None else told.sigma_m
 
     def _able(self, revision: bytes) -> list[int]:
-        """Return the peers that are localized in a map, and believed."""
+        """Return the peers that see a map, and are believed.
+
+        Who is localized by its own frames alone, or by another's word, could not tell: all that a
+        request would do is keep the map away that both lack.
+        """
         group = self._group
         return [
             peer
@@ -167,4 +171,5 @@ class HostChoice:
             and peer in group.trusted
             and (state := group.state_of(peer))
             and state.localized
+            and state.tracked
         ]
