@@ -12,7 +12,7 @@ from vcl_companion.swarm.group import Group, PeerJoined, PeerLost, SwarmOptions
 from vcl_companion.swarm.pose_requests import HostChoice
 from vcl_companion.wire.messages import MapState
 
-MAP = MapState(b"revision", 900, True, world=b"world   ")
+MAP = MapState(b"revision", 900, True, tracked=80, world=b"world   ")
 STEP_S, LOSS = 0.1, 0.1
 
 
