@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -13,17 +13,25 @@ from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.odometry import Odometry
 from vcl_companion.daemon.workshop import Workshop
+from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.localization.fix import Localized, Prior
-from vcl_companion.localization.pipeline import PipelineOptions, follow
+from vcl_companion.geometry.rotation import Array
+from vcl_companion.localization.fix import Localized, NotLocalized, Prior
+from vcl_companion.localization.pipeline import PipelineOptions, follow, follow_own_views
 from vcl_companion.mapping.templates import Templates
 from vcl_companion.recording.sensor import Sensor
+from vcl_companion.vision.features import Image
 
 # A prediction as a filter's between frames, 1 sigma; it is told as twice that.
 _PREDICTED = np.array([0.02] * 3 + [0.002] * 3)
 # As if the map showed so little: own frames are got ready.
 _LITTLE = 0.1
 _WORLD = b"", 0
+
+_Follows = Callable[
+    [Image, Camera, Pose, Templates, Prior, Array | None, PipelineOptions],
+    Localized | NotLocalized,
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +97,7 @@ class _Flight:
         making = asyncio.create_task(self._odometry.run())
         is_first = True
         for shot in on_map:
-            fix = self._found(shot, self._templates)
+            fix = self._found(shot, self._templates, follow)
             if fix is not None:
                 covered = fix.covered if is_first else min(fix.covered, _LITTLE)
                 await self._note(shot, replace(fix, covered=covered), self._templates)
@@ -99,9 +107,8 @@ class _Flight:
             local = self._odometry.templates
             if local is None:
                 break
-            fix = self._found(shot, local)
+            fix = self._found(shot, local, follow_own_views)
             if fix is not None:
-                fix = replace(fix, by="odometry")
                 await self._note(shot, fix, local)
             out.append(fix)
         making.cancel()
@@ -114,9 +121,9 @@ class _Flight:
         self._odometry.note(shot.frame, fix, seen, _WORLD)
         await self._odometry.settled()
 
-    def _found(self, shot: Shot, templates: Templates) -> Localized | None:
+    def _found(self, shot: Shot, templates: Templates, by: _Follows) -> Localized | None:
         prior = predicted(shot.true.retracted(self._off), self._rng)
-        fix = follow(
+        fix = by(
             shot.frame.image, self._sensor.camera, self._sensor.body_from_cam, templates,
             prior, None, self._options,
         )  # fmt: skip

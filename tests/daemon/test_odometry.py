@@ -26,7 +26,7 @@ from vcl_companion.geometry.rotation import Array, exp_so3, matrix_from_euler
 from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized, NotLocalized, Prior, Recognised
 from vcl_companion.localization.map_index import MapIndex
-from vcl_companion.localization.pipeline import follow, localize
+from vcl_companion.localization.pipeline import follow, follow_own_views, localize
 from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.mapping.local_map import LocalMap
 from vcl_companion.mapping.options import NoMap
@@ -140,9 +140,9 @@ async def flown(
             if goes_on and local is None and isinstance(fix, NotLocalized):
                 local = await odometry.begun(WORLD)
             if goes_on and local is not None and prior is not None and odometry.may_tell_more(fix):
-                own = follow(*given, local, prior, attitude, options.of_own_views())
+                own = follow_own_views(*given, local, prior, attitude, options)
                 if isinstance(own, Localized) and odometry.tells_more(own, fix):
-                    fix, seen = replace(own, by="odometry"), local
+                    fix, seen = own, local
             state: FilterState | NotLocalized | None = None
             if isinstance(fix, Localized):
                 state = estimator.take_fix(predicted, fix, at_ns, attitude)

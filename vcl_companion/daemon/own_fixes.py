@@ -19,7 +19,7 @@ from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.localization.pipeline import (
     Effort,
     PipelineOptions,
-    follow,
+    follow_own_views,
     is_doubtful,
     localize,
 )
@@ -128,18 +128,19 @@ class OwnFixes:
         predicted = self._estimator.predicted(at_ns, ned_from_body)
         if predicted is None:
             return None
+        options = self._options.by_heading(self._estimator.has_heading)
         own: Localized | NotLocalized = NotLocalized("not looked for")
         for prior in predicted.priors_on_own_views():
             own = await asyncio.get_running_loop().run_in_executor(
                 self._executor,
-                follow,
+                follow_own_views,
                 frame.image,
                 self._sensor.camera,
                 self._sensor.body_from_cam,
                 local,
                 prior,
                 ned_from_body,
-                self._options.of_own_views().by_heading(self._estimator.has_heading),
+                options,
             )
             if isinstance(own, Localized):
                 break
@@ -147,7 +148,7 @@ class OwnFixes:
             return None
         if self._maps.has_left_world(on_map.stored.world):
             return None
-        return replace(on_map, fix=replace(own, by="odometry"), local=local)
+        return replace(on_map, fix=own, local=local)
 
     async def look_by_patches(self, frame: Frame) -> Look | None:
         """Look at a frame by patches alone, once.

@@ -32,14 +32,14 @@ _SINGULAR = 1e-12
 
 
 def with_keyframes(state: FilterState, fix: Localized) -> FilterState:
-    """Return the state with the keyframe errors of the fix's map; of another one, as if new."""
+    """Return the state itself on the map that it was found by; on another, with its errors.
+
+    Those are as yet not correlated with the state.
+    """
     if state.considers(fix.keyframe_covariance):
         return state
-    n_map = fix.map_lever.shape[1]
-    covariance = np.zeros((N_OWN + n_map, N_OWN + n_map))
-    covariance[:N_OWN, :N_OWN] = state.covariance[:N_OWN, :N_OWN]
-    covariance[N_OWN:, N_OWN:] = fix.keyframe_covariance
-    return replace(state, covariance=covariance)
+    own = state.covariance[:N_OWN, :N_OWN]
+    return _with_keyframes(state, own, np.zeros_like(fix.map_lever), fix)
 
 
 def on_own_views(state: FilterState, fix: Localized, measured: Measurement) -> FilterState:
@@ -56,12 +56,9 @@ def on_own_views(state: FilterState, fix: Localized, measured: Measurement) -> F
     """
     lever = _lever_of_state(state, fix)
     shared = lever @ fix.keyframe_covariance
-    covariance = with_keyframes(state, fix).covariance.copy()
-    covariance[:N_OWN, :N_OWN] = state.beside_keyframes()
-    covariance[:_N_POSE, :_N_POSE] += shared @ lever.T
-    return _unless_contradicted(
-        _correlated(replace(state, covariance=covariance), shared), measured
-    )
+    own = state.beside_keyframes()
+    own[:_N_POSE, :_N_POSE] += shared @ lever.T
+    return _unless_contradicted(_with_keyframes(state, own, shared, fix), measured)
 
 
 def on_revision(state: FilterState, fix: Localized, measured: Measurement) -> FilterState:
@@ -73,21 +70,30 @@ def on_revision(state: FilterState, fix: Localized, measured: Measurement) -> Fi
     fix contradicts that, the revision is believed, and only the speed kept.
 
     Args:
-        state: with the keyframes of the fix's map, as yet not correlated with them.
+        state: with any keyframes' errors, these are not looked at.
         fix: by that map.
         measured: the same, as the filter takes it.
     """
     lever = _lever_of_state(state, fix)
     by_fix = lever @ fix.keyframe_covariance
     shared = _in_common(_beside_motion(state), by_fix @ lever.T) @ by_fix
-    return _unless_contradicted(_correlated(state, shared), measured)
+    own = state.covariance[:N_OWN, :N_OWN]
+    return _unless_contradicted(_with_keyframes(state, own, shared, fix), measured)
 
 
-def _correlated(state: FilterState, shared: Array) -> FilterState:
-    """Return a state whose position and offset covary so with the keyframes, (6, 6V)."""
-    covariance = state.covariance.copy()
-    covariance[:_N_POSE, N_OWN:] = shared
-    covariance[N_OWN:, :_N_POSE] = shared.T
+def _with_keyframes(state: FilterState, own: Array, shared: Array, fix: Localized) -> FilterState:
+    """Return a state with the keyframe errors of a fix's map.
+
+    Args:
+        state: with those of any.
+        own: (12, 12) covariance of the error state without them.
+        shared: (6, 6V) of position and offset with them.
+        fix: by the map.
+    """
+    n = N_OWN + shared.shape[1]
+    covariance = np.zeros((n, n))
+    covariance[:N_OWN, :N_OWN], covariance[N_OWN:, N_OWN:] = own, fix.keyframe_covariance
+    covariance[:_N_POSE, N_OWN:], covariance[N_OWN:, :_N_POSE] = shared, shared.T
     return replace(state, covariance=covariance)
 
 

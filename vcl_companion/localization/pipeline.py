@@ -55,10 +55,6 @@ class PipelineOptions:
             return self
         return replace(self, localization=self.localization.of_any_heading())
 
-    def of_own_views(self) -> PipelineOptions:
-        """Return the same for a frame that is looked at by the drone's own last ones."""
-        return replace(self, localization=self.localization.of_own_views())
-
 
 @dataclass(frozen=True, kw_only=True)
 class Effort:
@@ -156,6 +152,24 @@ def follow(
         image, camera, body_from_cam, templates, prior, ned_from_body,
         options.tracking, options.localization, options.drone_id,
     ))  # fmt: skip
+
+
+def follow_own_views(
+    image: Image,
+    camera: Camera,
+    body_from_cam: Pose,
+    templates: Templates,
+    prior: Prior,
+    ned_from_body: Array | None,
+    options: PipelineOptions,
+) -> Localized | NotLocalized:
+    """Find the drone's pose by a local map of its own last frames, however vague that is.
+
+    See ``follow``; vague up to ``LocalizationOptions.max_own_sigma_m``.
+    """
+    options = replace(options, localization=options.localization.of_own_views())
+    found = follow(image, camera, body_from_cam, templates, prior, ned_from_body, options)
+    return replace(found, by="odometry") if isinstance(found, Localized) else found
 
 
 def is_doubtful(fix: Localized) -> bool:

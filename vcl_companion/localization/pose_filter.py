@@ -176,7 +176,7 @@ def update(predicted: FilterState, fix: Localized) -> FilterState | NotLocalized
         _observation(predicted, fix),
         fix.noise_covariance + fix.own_map_covariance,
     )
-    is_another = not before.considers(fix.keyframe_covariance)
+    is_another = predicted is not before
     if is_another and not fix.is_on_map:
         predicted = on_own_views(before, fix, measured)
     believed = reconciled(predicted, fix, measured)
