@@ -16,8 +16,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from vcl_companion.compiled import compiled
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision.compiled import compiled
 
 # Of a texel.
 _STEPS = 32

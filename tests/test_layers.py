@@ -15,7 +15,7 @@ PACKAGE = "vcl_companion"
 
 # From the ground up. What stands on one shelf does not see its neighbours.
 SHELVES = (
-    ("errors", "clock", "options"),
+    ("errors", "clock", "options", "compiled"),
     ("geometry",),
     ("vision",),
     ("mapping",),

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from vcl_companion.compiled import compiled
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.vision.acransac import (
     AcRansacOptions,
@@ -19,7 +20,6 @@ from vcl_companion.vision.acransac import (
     consensus_of,
     distinct,
 )
-from vcl_companion.vision.compiled import compiled
 
 SIDE_PX = 1000.0
 

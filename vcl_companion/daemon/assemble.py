@@ -21,6 +21,7 @@ from vcl_companion.cameras.mounting import mounting_text, read_calibration
 from vcl_companion.cameras.open import open_camera
 from vcl_companion.cameras.stream import StreamCamera
 from vcl_companion.clock import Clock, ManualClock, SystemClock
+from vcl_companion.compiled import pack_kernels
 from vcl_companion.config import Config
 from vcl_companion.daemon import notify
 from vcl_companion.daemon.catching_up import CatchingUp
@@ -61,7 +62,6 @@ from vcl_companion.links.peers import PeerLink, open_signing
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.transfer import Transfers
-from vcl_companion.vision.compiled import pack_kernels
 from vcl_companion.wire.warm_up import warm_up
 
 _log = logging.getLogger(__name__)

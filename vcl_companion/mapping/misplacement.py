@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from vcl_companion.compiled import writable
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.vision.bundle import observations_of
-from vcl_companion.vision.compiled import writable
 from vcl_companion.vision.joint_kernels import seen_aside
 
 # All by poses' NEES in rendered flights and in photographs. Whatever a map says of itself:

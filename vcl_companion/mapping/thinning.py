@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vcl_companion.compiled import compiled
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import LandmarkMap
-from vcl_companion.vision.compiled import compiled
 
 Index = NDArray[np.intp]
 

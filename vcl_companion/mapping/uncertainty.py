@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vcl_companion.compiled import writable
 from vcl_companion.geometry.pose import adjoint
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.landmark_map import LandmarkMap
@@ -31,7 +32,6 @@ from vcl_companion.vision.bundle import (
     matrices_of,
     observations_of,
 )
-from vcl_companion.vision.compiled import writable
 from vcl_companion.vision.information import covariance_of
 from vcl_companion.vision.joint_kernels import joined, without_points
 from vcl_companion.vision.schur import carried

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from vcl_companion.compiled import compiled
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, orthonormalized
 from vcl_companion.vision.acransac import (
@@ -19,7 +20,6 @@ from vcl_companion.vision.acransac import (
     ac_ransac,
     consensus_of,
 )
-from vcl_companion.vision.compiled import compiled
 from vcl_companion.vision.p3p import MAX_MODELS, SAMPLE_SIZE, poses_of_samples
 
 ErrorKind = Literal["pixel", "angle"]

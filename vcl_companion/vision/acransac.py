@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from vcl_companion.compiled import compiled
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision.compiled import compiled
 
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.int64]

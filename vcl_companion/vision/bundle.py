@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from vcl_companion.compiled import writable
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, skew
 from vcl_companion.vision import bundle_kernels as kernels
-from vcl_companion.vision.compiled import writable
 
 _MIN_DEPTH_M = 1e-3
 

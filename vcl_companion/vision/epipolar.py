@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
+from vcl_companion.compiled import compiled
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision.compiled import compiled
 
 _FINEST_PX = 0.01
 _NEVER = -30.0

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from vcl_companion.compiled import compiled
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision.compiled import compiled
 from vcl_companion.vision.features import Features
 
 Index = NDArray[np.intp]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vcl_companion.vision.compiled import compiled
+from vcl_companion.compiled import compiled
 
 Ints = NDArray[np.int64]
 Words = NDArray[np.uint64]

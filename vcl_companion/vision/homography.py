@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from vcl_companion.compiled import compiled
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, orthonormalized
 from vcl_companion.vision.acransac import THRESHOLD_SIGMAS, Indices
-from vcl_companion.vision.compiled import compiled
 
 
 @dataclass(frozen=True, eq=False)

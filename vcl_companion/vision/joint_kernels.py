@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from vcl_companion.compiled import compiled
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.vision.bundle_kernels import Ints, linearized
-from vcl_companion.vision.compiled import compiled
 
 
 @compiled

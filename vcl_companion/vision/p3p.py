@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from vcl_companion.compiled import compiled
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, orthonormalized
-from vcl_companion.vision.compiled import compiled
 
 SAMPLE_SIZE = 3
 MAX_MODELS = 4

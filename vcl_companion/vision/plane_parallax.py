@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from vcl_companion.compiled import compiled
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, skew
 from vcl_companion.vision.acransac import Mask
-from vcl_companion.vision.compiled import compiled
 from vcl_companion.vision.epipolar import squared_sampson
 
 _ROUNDS = 24

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from vcl_companion.compiled import reordered
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision.compiled import reordered
 
 Ints = NDArray[np.int64]
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from vcl_companion.compiled import compiled
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision.compiled import compiled
 
 _ROUNDS = 6
 # Of surfaces that stand anyhow many are steep: a street recedes by more than five times its width.

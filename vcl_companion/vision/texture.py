@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from vcl_companion.compiled import compiled
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision.compiled import compiled
 from vcl_companion.vision.features import Image
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from vcl_companion.compiled import compiled, writable
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision.compiled import compiled, writable
 
 
 def triangulate(worlds_from_cams: list[Pose], ideal: Array) -> Array:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from vcl_companion.vision.compiled import writable
+from vcl_companion.compiled import writable
 from vcl_companion.wire.landmark_kernels import (
     AT,
     CODE,

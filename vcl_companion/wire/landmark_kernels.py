@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vcl_companion.vision.compiled import compiled
+from vcl_companion.compiled import compiled
 
 Integers = NDArray[np.int64]
 Bytes = NDArray[np.uint8]

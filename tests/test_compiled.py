@@ -8,8 +8,8 @@ from typing import cast
 import numba
 import numpy as np
 
+from vcl_companion.compiled import pack_kernels
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision.compiled import pack_kernels
 from vcl_companion.vision.joint_kernels import seen_aside
 
 
