@@ -14,6 +14,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from vcl_companion.geometry.lens_kernels import distorted, undistorted
+from vcl_companion.geometry.lens_kernels import slopes as lens_slopes
 from vcl_companion.geometry.rotation import Array
 
 DistortionModel = Literal["none", "radial-tangential", "equidistant"]
@@ -107,7 +109,7 @@ class Camera:
             slopes[:, 0, 0], slopes[:, 1, 1] = self.fx_px, self.fy_px
             return slopes
         if self.distortion_model == "radial-tangential":
-            slopes = self._radial_tangential_slopes(ideal) * [[self.fx_px], [self.fy_px]]
+            slopes = lens_slopes(_numbers(ideal), self._lens) * [[self.fx_px], [self.fy_px]]
             slopes[(ideal**2).sum(axis=1) >= self._fold_r2] = np.nan
             return np.asarray(slopes)
         step = 1e-6
@@ -124,21 +126,15 @@ class Camera:
         Newton's method on the distortion; a row is NaN where it finds nothing
         (a pixel the model cannot have produced).
         """
-        distorted = (np.asarray(pixels, dtype=np.float64) - (self.cx_px, self.cy_px)) / (
-            self.fx_px,
-            self.fy_px,
-        )
+        shown = (_numbers(pixels) - (self.cx_px, self.cy_px)) / (self.fx_px, self.fy_px)
         if self._is_undistorted:
-            return np.asarray(distorted)
-        with np.errstate(all="ignore"):  # rows without a solution run away and end as NaN
-            if self.distortion_model == "equidistant":
-                return self._ideal_from_equidistant(distorted)
-            return self._ideal_from_radial_tangential(distorted)
+            return np.asarray(shown)
+        return undistorted(shown, self._lens, self._is_fisheye, self._fold_r2)
 
     @cached_property
     def _is_undistorted(self) -> bool:
         """Whether the lens is a pinhole: of the equidistant model none is."""
-        return self.distortion_model != "equidistant" and not any(self.distortion)
+        return not self._is_fisheye and not any(self.distortion)
 
     @cached_property
     def _fold_r2(self) -> float:
@@ -149,7 +145,7 @@ class Camera:
         """
         if not any(self.distortion):
             return np.inf
-        fisheye = self.distortion_model == "equidistant"
+        fisheye = self._is_fisheye
         radial = self.distortion if fisheye else self.distortion[:2] + self.distortion[4:]
         slope = np.array([1.0, *((2 * n + 3) * k for n, k in enumerate(radial))])
         # The root finder is no match for numbers that are no lens; a peer may send some.
@@ -161,75 +157,22 @@ class Camera:
             return square
         return float(np.tan(np.sqrt(square)) ** 2) if square < (np.pi / 2) ** 2 else np.inf
 
-    def _ideal_from_radial_tangential(self, distorted: Array) -> Array:
-        """Invert by Newton's method; NaN where it does not converge."""
-        ideal = distorted.copy()
-        for _ in range(20):
-            error = self._distorted(ideal) - distorted
-            if not np.any(np.abs(error) >= 1e-12):
-                break
-            (a, b), (c, d) = np.moveaxis(self._radial_tangential_slopes(ideal), 0, 2)
-            x, y = error[:, 0], error[:, 1]
-            step = np.stack([d * x - b * y, a * y - c * x], axis=1)
-            ideal = ideal - step / (a * d - b * c)[:, None]
-        good = np.abs(self._distorted(ideal) - distorted).max(axis=1) < 1e-8
-        good &= (ideal**2).sum(axis=1) < self._fold_r2
-        ideal[~good] = np.nan
-        return ideal
-
-    def _radial_tangential_slopes(self, ideal: Array) -> Array:
-        """Return (N, 2, 2) d(distorted) / d(ideal) at (N, 2) ideal coordinates."""
-        k1, k2, p1, p2, k3 = (*self.distortion, 0.0)[:5]
-        x, y = ideal[:, 0], ideal[:, 1]
-        r2 = x * x + y * y
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        growth = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
-        out = np.empty((len(ideal), 2, 2))
-        out[:, 0, 0] = radial + x * x * growth + 2.0 * p1 * y + 6.0 * p2 * x
-        out[:, 0, 1] = out[:, 1, 0] = x * y * growth + 2.0 * p1 * x + 2.0 * p2 * y
-        out[:, 1, 1] = radial + y * y * growth + 6.0 * p1 * y + 2.0 * p2 * x
-        return out
-
     def _distorted(self, ideal: Array) -> Array:
         """Return (N, 2) distorted normalised coordinates of (N, 2) ideal ones."""
         if self._is_undistorted:
             return ideal
-        x, y = ideal[:, 0], ideal[:, 1]
-        r2 = x * x + y * y
-        if self.distortion_model == "radial-tangential":
-            k1, k2, p1, p2, k3 = (*self.distortion, 0.0)[:5]
-            radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-            return np.stack(
-                [
-                    x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-                    y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-                ],
-                axis=1,
-            )
-        r = np.sqrt(r2)
-        theta = np.arctan(r)
-        k1, k2, k3, k4 = self.distortion
-        t2 = theta * theta
-        theta_d = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-        scale = np.where(r > 1e-9, theta_d / np.maximum(r, 1e-9), 1.0)
-        return np.asarray(ideal * scale[:, None])
+        return distorted(_numbers(ideal), self._lens, self._is_fisheye)
 
-    def _ideal_from_equidistant(self, distorted: Array) -> Array:
-        """Invert Kannala-Brandt by Newton's method on the angle; NaN at 90 degrees and beyond."""
-        k1, k2, k3, k4 = self.distortion
-        theta_d = np.hypot(distorted[:, 0], distorted[:, 1])
-        theta = np.minimum(theta_d, np.pi / 2)
-        for _ in range(20):
-            t2 = theta * theta
-            value = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-            slope = 1.0 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-            step = (value - theta_d) / slope
-            theta = theta - step
-            if not np.any(np.abs(step) >= 1e-12):
-                break
-        t2 = theta * theta
-        value = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-        ok = (np.abs(value - theta_d) < 1e-9) & (theta >= 0.0) & (theta < np.pi / 2 - 1e-3)
-        ok &= np.tan(theta) ** 2 < self._fold_r2
-        scale = np.where(theta_d > 1e-9, np.tan(theta) / np.maximum(theta_d, 1e-9), 1.0)
-        return np.asarray(np.where(ok, scale, np.nan)[:, None] * distorted)
+    @cached_property
+    def _lens(self) -> Array:
+        """The coefficients as ``lens_kernels`` takes them."""
+        return np.array((*self.distortion, 0.0)[:5])
+
+    @property
+    def _is_fisheye(self) -> bool:
+        return self.distortion_model == "equidistant"
+
+
+def _numbers(values: Array) -> Array:
+    """Return an array as the kernels take theirs: for another kind they are compiled anew."""
+    return np.require(values, np.float64, ["C", "W"])

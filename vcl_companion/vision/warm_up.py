@@ -63,6 +63,9 @@ def warm_up() -> None:
     match_epipolar(still, still, ideal_a, ideal_b, b_from_a, (0.1, 0.3), 320.0)
     _adjust(points)
     _track(rng)
+    for model in ("radial-tangential", "equidistant"):
+        lens = Camera(640, 480, 320.0, 320.0, 320.0, 240.0, model, (-0.1, 0.0, 0.0, 0.0))
+        lens.pixel_slopes(lens.ideal_from_pixels(lens.pixels_from_ideal(ideal_a)))
 
 
 def _join(points: Array) -> None:
