@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -218,7 +219,7 @@ def test_who_does_not_know_where_all_of_it_is_goes_on_no_less_well() -> None:
 
 def test_by_own_frames_it_goes_on_where_a_pose_by_the_map_would_be_too_vague() -> None:
     """What they are off they are off alike: refused, nothing would lead back to the map."""
-    most_m = 0.02
+    most_m = 0.015
     frames = asyncio.run(flown(np.random.default_rng(5), goes_on=True, most_m=most_m))
     assert all(by(f) in ("patches", "odometry") for f in frames[1:])
     assert by(frames[-1]) == "patches"
@@ -374,5 +375,37 @@ def test_frames_that_bring_nothing_are_not_kept(gap_s: float) -> None:
         odometry.note(Frame(image, 10**12, 99, 0), fix, templates, (b"another", 0))
         assert len(odometry._window.views) == 1
         work.end()
+
+    run(scenario())
+
+
+@pytest.mark.parametrize(("covered", "made_at"), [(0.6, [4, 7, 10]), (0.45, [4, 6, 8, 10])])
+def test_a_local_map_is_made_anew_where_the_last_one_is_left_behind(
+    covered: float, made_at: list[int]
+) -> None:
+    """By eight degrees while the swarm's map is well in sight, by four where it may be gone."""
+
+    async def scenario() -> None:
+        index, templates = chart()
+        made: list[int] = []
+
+        class Telling(Workshop):
+            def local_map(self, *given: Any) -> LocalMap | NoMap:
+                made.append(k)
+                return super().local_map(*given)
+
+        async with making(Telling) as odometry:
+            for k in range(11):
+                turned = exp_so3(np.array([0.0, 0.0, np.deg2rad(3.0 * k)]))
+                truth = Pose(turned @ truth_at(0.0).rotation, truth_at(0.0).translation)
+                image = photograph(truth, np.random.default_rng(k))
+                prior = Prior(truth, np.diag(np.repeat([0.01, 0.001], 3) ** 2))
+                fix = localize(image, PINHOLE, MOUNTING, index, templates, prior, None, OPTIONS)
+                assert isinstance(fix, Localized)
+                frame = Frame(image, k * 10**8, k, 0)
+                shown = replace(fix, covered=covered if k else fix.covered)
+                odometry.note(frame, shown, templates, WORLD)
+                await odometry.settled()
+        assert made == made_at
 
     run(scenario())

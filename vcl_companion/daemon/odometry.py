@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -48,6 +49,10 @@ _HARDLY_COVERED, _CLEARLY_SURER = 0.4, 0.8
 _TURNED_SURER = 8.0
 # A frame that has been lost waits no longer for a local map; the next ones have it.
 _BEGUN_WITHIN_S = 0.5
+# So far from the newest view of a local map it is made anew: sooner it would show hardly more, and
+# each adds to what we are off. Farther while the swarm's map fills more than such a share of the
+# image: it takes a tenth of the time that a round's map takes to be built, beside it.
+_LEFT_BEHIND, _LEFT_BEHIND_IN_SIGHT, _IN_SIGHT = 0.5, 1.0, 0.5
 # Landmarks of a map by which it is told how far its scene is.
 _N_FOR_DEPTH = 2000
 
@@ -143,7 +148,10 @@ class Odometry:
         most = max(fix.covered, most if by is fix.keyframe_covariance else _OF_MOST * most)
         self._most_covered = fix.keyframe_covariance, most
         if fix.covered < min(_COVERED, _OF_MOST * most):
-            self._want()
+            is_in_sight = fix.is_on_map and fix.covered > _IN_SIGHT
+            far = _LEFT_BEHIND_IN_SIGHT if is_in_sight else _LEFT_BEHIND
+            if self._from_newest(fix.world_from_body) >= far:
+                self._want()
         elif fix.is_on_map:
             self._local = None
 
@@ -217,6 +225,12 @@ class Odometry:
     def _may_go(self, frame: Frame) -> bool:
         """Whether no local map in use is made of a frame."""
         return self._local is None or frame not in self._local.keyframes
+
+    def _from_newest(self, world_from_body: Pose) -> float:
+        """Return how far a view is from the local map's newest one; see ``_apart``."""
+        if self._local is None:
+            return math.inf
+        return self._apart(self._window.pose_of(self._local.keyframes[0]), world_from_body)
 
     def _apart(self, a: Pose, b: Pose) -> float:
         """Return how far two views are apart, as a multiple of what they are to be."""
