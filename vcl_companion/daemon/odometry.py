@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -148,9 +147,7 @@ class Odometry:
         most = max(fix.covered, most if by is fix.keyframe_covariance else _OF_MOST * most)
         self._most_covered = fix.keyframe_covariance, most
         if fix.covered < min(_COVERED, _OF_MOST * most):
-            is_in_sight = fix.is_on_map and fix.covered > _IN_SIGHT
-            far = _LEFT_BEHIND_IN_SIGHT if is_in_sight else _LEFT_BEHIND
-            if self._from_newest(fix.world_from_body) >= far:
+            if self._is_left_behind(fix):
                 self._want()
         elif fix.is_on_map:
             self._local = None
@@ -226,11 +223,14 @@ class Odometry:
         """Whether no local map in use is made of a frame."""
         return self._local is None or frame not in self._local.keyframes
 
-    def _from_newest(self, world_from_body: Pose) -> float:
-        """Return how far a view is from the local map's newest one; see ``_apart``."""
+    def _is_left_behind(self, fix: Localized) -> bool:
+        """Whether a frame is so far from the local map's newest view that another is to be made."""
         if self._local is None:
-            return math.inf
-        return self._apart(self._window.pose_of(self._local.keyframes[0]), world_from_body)
+            return True
+        is_in_sight = fix.is_on_map and fix.covered > _IN_SIGHT
+        far = _LEFT_BEHIND_IN_SIGHT if is_in_sight else _LEFT_BEHIND
+        newest = self._window.pose_of(self._local.keyframes[0])
+        return self._apart(newest, fix.world_from_body) >= far
 
     def _apart(self, a: Pose, b: Pose) -> float:
         """Return how far two views are apart, as a multiple of what they are to be."""

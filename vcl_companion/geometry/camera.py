@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vcl_companion.geometry.lens_kernels import distorted, undistorted
-from vcl_companion.geometry.lens_kernels import slopes as lens_slopes
+from vcl_companion.compiled import writable
+from vcl_companion.geometry import lens_kernels
 from vcl_companion.geometry.rotation import Array
 
 DistortionModel = Literal["none", "radial-tangential", "equidistant"]
@@ -109,7 +109,7 @@ class Camera:
             slopes[:, 0, 0], slopes[:, 1, 1] = self.fx_px, self.fy_px
             return slopes
         if self.distortion_model == "radial-tangential":
-            slopes = lens_slopes(_numbers(ideal), self._lens) * [[self.fx_px], [self.fy_px]]
+            slopes = lens_kernels.slopes(_numbers(ideal), self._lens) * [[self.fx_px], [self.fy_px]]
             slopes[(ideal**2).sum(axis=1) >= self._fold_r2] = np.nan
             return np.asarray(slopes)
         step = 1e-6
@@ -129,7 +129,7 @@ class Camera:
         shown = (_numbers(pixels) - (self.cx_px, self.cy_px)) / (self.fx_px, self.fy_px)
         if self._is_undistorted:
             return np.asarray(shown)
-        return undistorted(shown, self._lens, self._is_fisheye, self._fold_r2)
+        return lens_kernels.undistorted(shown, self._lens, self._is_fisheye, self._fold_r2)
 
     @cached_property
     def _is_undistorted(self) -> bool:
@@ -161,7 +161,7 @@ class Camera:
         """Return (N, 2) distorted normalised coordinates of (N, 2) ideal ones."""
         if self._is_undistorted:
             return ideal
-        return distorted(_numbers(ideal), self._lens, self._is_fisheye)
+        return lens_kernels.distorted(_numbers(ideal), self._lens, self._is_fisheye)
 
     @cached_property
     def _lens(self) -> Array:
@@ -174,5 +174,5 @@ class Camera:
 
 
 def _numbers(values: Array) -> Array:
-    """Return an array as the kernels take theirs: for another kind they are compiled anew."""
-    return np.require(values, np.float64, ["C", "W"])
+    """Return points of any kind of number as kernels take theirs."""
+    return writable(np.asarray(values, dtype=np.float64))

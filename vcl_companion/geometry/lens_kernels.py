@@ -4,7 +4,9 @@ Of points in the thousands, a few hundred at a time and again for every view, th
 nothing beside a call into an array library for each step.
 
 A lens is (5,) coefficients: k1 k2 p1 p2 k3 of radial-tangential ones, k1 k2 k3 k4 0 of fisheyes
-(``Camera``).
+(``Camera``). Patches are warped by the same two models, with their slopes, in
+``vision/patch_views.py``: a kernel calls those of its own file only (``compiled``). Tests hold one
+against the other.
 """
 
 import math
