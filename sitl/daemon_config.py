@@ -46,6 +46,8 @@ def daemon_config(
     if planned.mission is not None:  # the recording is made as it flies
         calibration = run / "sensor.yaml"
     exactness = {"distance_sigma_m": TRUE_DISTANCE_SIGMA_M} if plan.are_distances_true else {}
+    if plan.recording.calibration_px is not None:
+        exactness["calibration_px"] = plan.recording.calibration_px
     wiring = {
         "system_id": planned.system_id,
         "clock": "camera",

@@ -77,8 +77,9 @@ def fly_live(
     progress("building the town", 0, 0)
     recording = plan.recording
     description = Description(
-        recording.name, recording.frame_rate_hz, plan.leader, recording.known_distances
-    )
+        recording.name, recording.frame_rate_hz, plan.leader, recording.known_distances,
+        recording.calibration_px,
+    )  # fmt: skip
     images = ImageOptions(scenario.image.format, scenario.image.jpg_quality)
     with RecordingWriter(recording.path, description, images) as writer:
         shots = LiveShots(scenario, plan, writer)
@@ -128,7 +129,7 @@ def plan_live(scenario: Scenario, out: Path, options: FlyOptions) -> FlightPlan:
     known = (KnownPair(*pair),) if pair and set(pair) <= names else ()
     recording = Recording(
         out / RECORDING_FOLDER, scenario.name, scenario.frame_rate_hz, scenario.leader, known,
-        tuple(drones),
+        tuple(drones), calibration_px=0.0,
     )  # fmt: skip
     plan = plan_flight(recording, options)
     flying = tuple(replace(p, mission=missions[p.name]) for p in plan.drones)

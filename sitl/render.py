@@ -37,7 +37,9 @@ def render_scenario(scenario: Scenario, out_dir: Path, progress: Progress | None
         RecordingError: the folder cannot be written, or holds something already.
     """
     pair = (KnownPair(*scenario.known_distance),) if scenario.known_distance else ()
-    description = Description(scenario.name, scenario.frame_rate_hz, scenario.leader, pair)
+    description = Description(
+        scenario.name, scenario.frame_rate_hz, scenario.leader, pair, calibration_px=0.0
+    )
     images = ImageOptions(scenario.image.format, scenario.image.jpg_quality)
     with RecordingWriter(out_dir, description, images) as writer:
         sensors = {drone.name: scenario.sensor(drone) for drone in scenario.drone}

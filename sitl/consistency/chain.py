@@ -28,7 +28,6 @@ from vcl_companion.vision.features import FeatureOptions, Image
 from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.header import BlobKind
 
-_MAPPING = MapOptions(distance_sigma_m=TRUE_DISTANCE_SIGMA_M)
 _PIPELINE = PipelineOptions(FeatureOptions(), LocalizationOptions(), TrackingOptions())
 _UPDATES = UpdateOptions()
 _ATTITUDE_DEG = 0.3
@@ -79,8 +78,11 @@ class Chain:
         apart = tuple(
             (a + 1, b + 1, self._apart_m(a, b)) for a, b in pairs if a in there and b in there
         )
+        mapping = MapOptions(distance_sigma_m=TRUE_DISTANCE_SIGMA_M)
+        if recording.calibration_px is not None:
+            mapping = replace(mapping, calibration_px=recording.calibration_px)
         options = WorkOptions(
-            apart, _MAPPING, _PIPELINE, _MAPPING.detectors, InterMavOptions(), tracked=True
+            apart, mapping, _PIPELINE, mapping.detectors, InterMavOptions(), tracked=True
         )
         self._workshop = Workshop(recording.drones[0].sensor, options)
         self._map: ReadyMap | None = None

@@ -22,6 +22,7 @@ DESCRIPTIONS = st.builds(
     st.none() | st.floats(1e-3, 1e5),
     st.none() | NAMES,
     st.lists(PAIRS, max_size=3).map(tuple),
+    st.none() | st.floats(0.0, 10.0),
 )
 
 
@@ -64,6 +65,10 @@ def test_forms_of_the_known_distance(tmp_path: Path, text: str, pairs: list[Know
         ("frame_rate_hz = true", "frame_rate_hz must be a positive number"),
         (f"frame_rate_hz = 0x{'f' * 5000}", "frame_rate_hz must be a positive number"),
         ('frame_rate_hz = "5"', "frame_rate_hz must be a positive number"),
+        ("calibration_px = -0.1", "calibration_px must lie in 0..10"),
+        ("calibration_px = 11", "calibration_px must lie in 0..10"),
+        ("calibration_px = nan", "calibration_px must lie in 0..10"),
+        ("calibration_px = false", "calibration_px must lie in 0..10"),
         ("leader = 0", "leader must be a text"),
         ('name = ""', "name must be a text"),
         ('known_distance = "mav0"', "known_distance must be"),

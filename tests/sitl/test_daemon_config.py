@@ -1,4 +1,5 @@
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,16 @@ def test_a_distance_of_the_truth_s_is_told_as_exact(
     plan = plan_flight(recording, FlyOptions(known_distances=(pair,)))
     config = daemon_config(plan, plan.drones[0], tmp_path / "out", 5001, 5002, 5003, [5004])
     assert config["map"].get("distance_sigma_m") == told_m
+
+
+@pytest.mark.parametrize("said_px", [None, 0.0, 0.25])
+def test_what_cameras_may_be_off_is_the_recording_s_to_say(
+    tmp_path: Path, said_px: float | None
+) -> None:
+    recording = read_recording(write_recording(tmp_path / "a", Flight(n_frames=2)))
+    plan = plan_flight(replace(recording, calibration_px=said_px), FlyOptions())
+    config = daemon_config(plan, plan.drones[0], tmp_path / "out", 5001, 5002, 5003, [])
+    assert config["map"].get("calibration_px") == said_px
 
 
 def test_a_daemon_is_told_where_things_are_and_nothing_of_the_truth(tmp_path: Path) -> None:

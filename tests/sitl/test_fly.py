@@ -51,7 +51,9 @@ def sitl_fly(*arguments: object) -> subprocess.CompletedProcess[str]:
 def start_of_demo(path: Path) -> Path:
     """Write the first frames of the demo as a recording of its own."""
     demo = read_recording(DEMO)
-    description = Description("start of demo", 5.0, demo.leader, demo.known_distances)
+    description = Description(
+        "start of demo", 5.0, demo.leader, demo.known_distances, demo.calibration_px
+    )
     with RecordingWriter(path, description) as writer:
         for drone in demo.drones:
             writer.add_drone(drone.name, drone.sensor, drone.truth)

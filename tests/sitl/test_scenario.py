@@ -186,6 +186,7 @@ def test_a_rendered_scenario_reads_back_and_is_the_same_every_time(tmp_path: Pat
     recording = read_recording(tmp_path / "one")
     assert (recording.name, recording.frame_rate_hz, recording.leader) == ("small", 4.0, "mav0")
     assert [(p.a, p.b, p.distance_m) for p in recording.known_distances] == [("mav0", "mav1", None)]
+    assert recording.calibration_px == 0.0
     for drone, told_by in zip(recording.drones, scenario.drone, strict=True):
         assert drone.sensor.camera == scenario.camera.camera()
         assert drone.sensor.body_from_cam.matrix() == pytest.approx(

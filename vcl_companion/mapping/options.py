@@ -25,7 +25,7 @@ class MapOptions:
         update_features: images that extend a map keep their detail around so many of their
             strongest features and are blurred elsewhere (``vision.focus``).
         calibration_px: what each drone's lens may be off its calibration at the image's border,
-            1 sigma: considered in all covariances; 0 for lenses that are exact.
+            1 sigma: considered in all covariances; 0 for lenses that are exact, as rendered ones.
         min_landmarks: fewer are refused.
         min_angle_deg: landmarks seen under a smaller angle are left out.
         max_error_px: observations that miss by more are left out.
@@ -47,7 +47,7 @@ class MapOptions:
     keyframe_quality: int = 60
     update_quality: int = 40
     update_features: int = 1000
-    calibration_px: float = 0.0
+    calibration_px: float = 0.1
     min_landmarks: int = 60
     min_angle_deg: float = 1.0
     max_error_px: float = 2.5

@@ -95,6 +95,7 @@ class Recording:
         leader: name of a drone; the first unless it says otherwise.
         known_distances: pairs of its drones whose distance at the start is known.
         drones: at least one, by rising number.
+        calibration_px: what its cameras may be off their calibration; None where it is silent.
     """
 
     path: Path
@@ -103,6 +104,7 @@ class Recording:
     leader: str
     known_distances: tuple[KnownPair, ...]
     drones: tuple[Drone, ...]
+    calibration_px: float | None = None
 
     def drone(self, name: str) -> Drone:
         """Return the drone of that name; KeyError when there is none."""
@@ -155,6 +157,7 @@ def _read_folder(path: Path) -> Recording:
         leader=description.leader or names[0],
         known_distances=description.known_distances,
         drones=drones,
+        calibration_px=description.calibration_px,
     )
 
 
