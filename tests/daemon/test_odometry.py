@@ -379,6 +379,19 @@ def test_frames_that_bring_nothing_are_not_kept(gap_s: float) -> None:
     run(scenario())
 
 
+def found_turned(
+    turned_deg: float, k: int, index: MapIndex, templates: Templates
+) -> tuple[Frame, Localized]:
+    """Return the k-th frame, of a drone that has turned on the spot, and what the map says."""
+    turn = exp_so3(np.array([0.0, 0.0, np.deg2rad(turned_deg)]))
+    truth = Pose(turn @ truth_at(0.0).rotation, truth_at(0.0).translation)
+    image = photograph(truth, np.random.default_rng(k))
+    prior = Prior(truth, np.diag(np.repeat([0.01, 0.001], 3) ** 2))
+    fix = localize(image, PINHOLE, MOUNTING, index, templates, prior, None, OPTIONS)
+    assert isinstance(fix, Localized)
+    return Frame(image, k * 10**8, k, 0), fix
+
+
 @pytest.mark.parametrize(("covered", "made_at"), [(0.6, [4, 7, 10]), (0.45, [4, 6, 8, 10])])
 def test_a_local_map_is_made_anew_where_the_last_one_is_left_behind(
     covered: float, made_at: list[int]
@@ -396,16 +409,36 @@ def test_a_local_map_is_made_anew_where_the_last_one_is_left_behind(
 
         async with making(Telling) as odometry:
             for k in range(11):
-                turned = exp_so3(np.array([0.0, 0.0, np.deg2rad(3.0 * k)]))
-                truth = Pose(turned @ truth_at(0.0).rotation, truth_at(0.0).translation)
-                image = photograph(truth, np.random.default_rng(k))
-                prior = Prior(truth, np.diag(np.repeat([0.01, 0.001], 3) ** 2))
-                fix = localize(image, PINHOLE, MOUNTING, index, templates, prior, None, OPTIONS)
-                assert isinstance(fix, Localized)
-                frame = Frame(image, k * 10**8, k, 0)
+                frame, fix = found_turned(3.0 * k, k, index, templates)
                 shown = replace(fix, covered=covered if k else fix.covered)
                 odometry.note(frame, shown, templates, WORLD)
                 await odometry.settled()
         assert made == made_at
+
+    run(scenario())
+
+
+@pytest.mark.parametrize(("first", "made_of"), [(0, [6, 5, 3, 1]), (3, [6, 5, 4, 3])])
+def test_a_local_map_is_made_of_views_far_apart_where_there_are_some(
+    first: int, made_of: list[int]
+) -> None:
+    """By a short way between them it is hardly told how far things are."""
+
+    async def scenario() -> None:
+        index, templates = chart()
+        made: list[list[int]] = []
+
+        class Telling(Workshop):
+            def local_map(self, images: Any, *given: Any) -> LocalMap | NoMap:
+                made.append([image.captured_at_ns // 10**8 for image in images])
+                return super().local_map(images, *given)
+
+        async with making(Telling) as odometry:
+            for k in range(first, 7):
+                frame, fix = found_turned(9.0 * (k - first), k, index, templates)
+                shown = replace(fix, covered=0.95 if k < 6 else 0.4)
+                odometry.note(frame, shown, templates, WORLD)
+            await odometry.settled()
+        assert made == [made_of]
 
     run(scenario())

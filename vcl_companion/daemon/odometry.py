@@ -36,6 +36,8 @@ _log = logging.getLogger(__name__)
 _MOST_VIEWS, _LEAST_VIEWS, _N_MORE = 4, 3, 4
 # They are so far apart: turned by so much, or moved by such a share of how far the scene is.
 _APART_RAD, _APART_SHARE = np.deg2rad(8.0), 0.06
+# A local map is made of the two newest, and of others that lie so many times farther apart.
+_FAR_APART = 2.2
 # A frame that is less than this share of that from the last one brings nothing.
 _NEWS = 0.3
 # Less of the image than this, and than this share of the most that the map in use has filled:
@@ -171,7 +173,7 @@ class Odometry:
 
     async def _make(self) -> None:
         window, scene, world = self._window, self._scene, self._world
-        keyframes = window.views[::-1][:_MOST_VIEWS]
+        keyframes = self._far_apart()
         if len(keyframes) < _LEAST_VIEWS or scene is None:
             return
         images = [
@@ -189,6 +191,21 @@ class Odometry:
         elif world == self._world and all(frame in window.views for frame in keyframes):
             window.settle(keyframes, made.placement)
             self._local = _Local(made.templates, keyframes)
+
+    def _far_apart(self) -> list[Frame]:
+        """Return the views that a local map is made of, the newest first.
+
+        The two newest show alike; the long way to others says best how far things are. Where none
+        are so far away, those that are.
+        """
+        newest_first = list(zip(self._window.views, self._window.poses, strict=True))[::-1]
+        chosen = newest_first[:2]
+        for view in newest_first[2:]:
+            if len(chosen) < _MOST_VIEWS and self._apart(chosen[-1][1], view[1]) >= _FAR_APART:
+                chosen.append(view)
+        others = [view for view in newest_first if view not in chosen]
+        chosen += others[: _MOST_VIEWS - len(chosen)]
+        return [view[0] for view in newest_first if view in chosen]
 
     def _add(self, frame: Frame, fix: Localized, seen: Templates) -> bool:
         """Put a frame into the window if it is to be there; whether it is."""
