@@ -12,7 +12,7 @@ from typing import Any
 from sitl.plan import FlightPlan, PlannedDrone, Setting
 from vcl_companion.config import parse_config
 from vcl_companion.errors import ConfigError
-from vcl_companion.recording.recording import CAMERA_FOLDER
+from vcl_companion.recording.recording import CAMERA_FOLDER, Recording
 
 _FLAT_OUT_WAIT_S = 30.0
 # As exactly as a place is surveyed for a recording's truth. What a daemon takes for granted is a
@@ -45,9 +45,6 @@ def daemon_config(
     calibration = plan.recording.path.resolve() / planned.name / CAMERA_FOLDER / "sensor.yaml"
     if planned.mission is not None:  # the recording is made as it flies
         calibration = run / "sensor.yaml"
-    exactness = {"distance_sigma_m": TRUE_DISTANCE_SIGMA_M} if plan.are_distances_true else {}
-    if plan.recording.calibration_px is not None:
-        exactness["calibration_px"] = plan.recording.calibration_px
     wiring = {
         "system_id": planned.system_id,
         "clock": "camera",
@@ -74,7 +71,10 @@ def daemon_config(
             "flight_log": str(run / "flight.jsonl"),
             "status_file": str(run / "status.json"),
         },
-        "map": {"directory": str(run / "maps"), **exactness},
+        "map": {
+            "directory": str(run / "maps"),
+            **exactness(plan.recording, plan.are_distances_true),
+        },
     }
     if math.isinf(plan.options.speed):
         # The recording's time stands still meanwhile; the outcome must not hang on the machine.
@@ -82,6 +82,19 @@ def daemon_config(
         # Frames as fast as they can be looked at would leave peers and links no time at all.
         wiring["scheduling"] = "normal"
     return with_settings(wiring, plan.options.settings)
+
+
+def exactness(recording: Recording, are_distances_true: bool) -> dict[str, Any]:
+    """Return the settings of a daemon's maps that say how exact what it is told is.
+
+    Args:
+        recording: may know of its cameras.
+        are_distances_true: whether known distances are the truth's.
+    """
+    told = {"distance_sigma_m": TRUE_DISTANCE_SIGMA_M} if are_distances_true else {}
+    if recording.calibration_px is not None:
+        told["calibration_px"] = recording.calibration_px
+    return told
 
 
 def check_settings(plan: FlightPlan) -> None:

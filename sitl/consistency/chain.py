@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sitl.consistency.alone import Shot, found_alone, predicted
-from sitl.daemon_config import TRUE_DISTANCE_SIGMA_M
+from sitl.daemon_config import exactness
 from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.map_offer import MapOffer, ReadyMap
 from vcl_companion.daemon.workshop import WorkOptions, Workshop
@@ -78,9 +78,7 @@ class Chain:
         apart = tuple(
             (a + 1, b + 1, self._apart_m(a, b)) for a, b in pairs if a in there and b in there
         )
-        mapping = MapOptions(distance_sigma_m=TRUE_DISTANCE_SIGMA_M)
-        if recording.calibration_px is not None:
-            mapping = replace(mapping, calibration_px=recording.calibration_px)
+        mapping = MapOptions(**exactness(recording, are_distances_true=True))
         options = WorkOptions(
             apart, mapping, _PIPELINE, mapping.detectors, InterMavOptions(), tracked=True
         )

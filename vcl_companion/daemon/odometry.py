@@ -198,14 +198,14 @@ class Odometry:
         The two newest show alike; the long way to others says best how far things are. Where none
         are so far away, those that are.
         """
-        newest_first = list(zip(self._window.views, self._window.poses, strict=True))[::-1]
+        newest_first, pose_of = self._window.views[::-1], self._window.pose_of
         chosen = newest_first[:2]
         for view in newest_first[2:]:
-            if len(chosen) < _MOST_VIEWS and self._apart(chosen[-1][1], view[1]) >= _FAR_APART:
+            if self._apart(pose_of(chosen[-1]), pose_of(view)) >= _FAR_APART:
                 chosen.append(view)
         others = [view for view in newest_first if view not in chosen]
-        chosen += others[: _MOST_VIEWS - len(chosen)]
-        return [view[0] for view in newest_first if view in chosen]
+        among = [*chosen, *others][:_MOST_VIEWS]
+        return [view for view in newest_first if view in among]
 
     def _add(self, frame: Frame, fix: Localized, seen: Templates) -> bool:
         """Put a frame into the window if it is to be there; whether it is."""
