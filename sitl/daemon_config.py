@@ -15,11 +15,6 @@ from vcl_companion.errors import ConfigError
 from vcl_companion.recording.recording import CAMERA_FOLDER, Recording
 
 _FLAT_OUT_WAIT_S = 30.0
-# As exactly as a place is surveyed for a recording's truth. What a daemon takes for granted is a
-# tape's centimetre: of drones 3 m apart it makes poses 30 m away uncertain by 10 cm, and an
-# autopilot that is told of 10 cm follows them less than the drift of its own accelerometers.
-TRUE_DISTANCE_SIGMA_M = 0.001
-"""How exactly a distance is known that is the truth's, m, 1 sigma."""
 # Autopilots in simulation have the cameras' clock. What is left are the steps in which their
 # estimators take poses in: anywhere within 10 ms (ArduPilot's EKF3).
 _TRUE_TIME_ERROR_S = 0.003
@@ -73,7 +68,7 @@ def daemon_config(
         },
         "map": {
             "directory": str(run / "maps"),
-            **exactness(plan.recording, plan.are_distances_true),
+            **exactness(plan.recording, plan.are_distances_recorded),
         },
     }
     if math.isinf(plan.options.speed):
@@ -84,14 +79,16 @@ def daemon_config(
     return with_settings(wiring, plan.options.settings)
 
 
-def exactness(recording: Recording, are_distances_true: bool) -> dict[str, Any]:
+def exactness(recording: Recording, are_distances_recorded: bool) -> dict[str, Any]:
     """Return the settings of a daemon's maps that say how exact what it is told is.
 
     Args:
-        recording: may know of its cameras.
-        are_distances_true: whether known distances are the truth's.
+        recording: may say so of its distances and its cameras.
+        are_distances_recorded: whether it is the recording's distances that are known.
     """
-    told = {"distance_sigma_m": TRUE_DISTANCE_SIGMA_M} if are_distances_true else {}
+    told = {}
+    if are_distances_recorded and recording.distance_sigma_m is not None:
+        told["distance_sigma_m"] = recording.distance_sigma_m
     if recording.calibration_px is not None:
         told["calibration_px"] = recording.calibration_px
     return told

@@ -23,6 +23,7 @@ from sitl.fly import Progress, flown, reported
 from sitl.out_folder import RECORDING_FOLDER, prepare_folder
 from sitl.pacing import Instant
 from sitl.plan import FlightPlan, FlyOptions, plan_flight
+from sitl.render import TRUTH_SIGMA_M
 from sitl.renderer import Renderer
 from sitl.scenario import Scenario
 from sitl.swarm import Swarm
@@ -78,7 +79,7 @@ def fly_live(
     recording = plan.recording
     description = Description(
         recording.name, recording.frame_rate_hz, plan.leader, recording.known_distances,
-        recording.calibration_px,
+        recording.distance_sigma_m, recording.calibration_px,
     )  # fmt: skip
     images = ImageOptions(scenario.image.format, scenario.image.jpg_quality)
     with RecordingWriter(recording.path, description, images) as writer:
@@ -129,7 +130,7 @@ def plan_live(scenario: Scenario, out: Path, options: FlyOptions) -> FlightPlan:
     known = (KnownPair(*pair),) if pair and set(pair) <= names else ()
     recording = Recording(
         out / RECORDING_FOLDER, scenario.name, scenario.frame_rate_hz, scenario.leader, known,
-        tuple(drones), calibration_px=0.0,
+        tuple(drones), TRUTH_SIGMA_M, calibration_px=0.0,
     )  # fmt: skip
     plan = plan_flight(recording, options)
     flying = tuple(replace(p, mission=missions[p.name]) for p in plan.drones)

@@ -20,6 +20,10 @@ from vcl_companion.recording import (
     Trajectory,
 )
 
+TRUTH_SIGMA_M = 0.001
+"""How well a distance is known between two that a scenario places, 1 sigma: exactly, which no
+adjustment could take in."""
+
 Progress = Callable[[int, int], None]  # frames done, frames in all
 
 
@@ -38,7 +42,7 @@ def render_scenario(scenario: Scenario, out_dir: Path, progress: Progress | None
     """
     pair = (KnownPair(*scenario.known_distance),) if scenario.known_distance else ()
     description = Description(
-        scenario.name, scenario.frame_rate_hz, scenario.leader, pair, calibration_px=0.0
+        scenario.name, scenario.frame_rate_hz, scenario.leader, pair, TRUTH_SIGMA_M, 0.0
     )
     images = ImageOptions(scenario.image.format, scenario.image.jpg_quality)
     with RecordingWriter(out_dir, description, images) as writer:

@@ -78,7 +78,7 @@ class Chain:
         apart = tuple(
             (a + 1, b + 1, self._apart_m(a, b)) for a, b in pairs if a in there and b in there
         )
-        mapping = MapOptions(**exactness(recording, are_distances_true=True))
+        mapping = MapOptions(**exactness(recording, are_distances_recorded=True))
         options = WorkOptions(
             apart, mapping, _PIPELINE, mapping.detectors, InterMavOptions(), tracked=True
         )

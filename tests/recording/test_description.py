@@ -22,6 +22,7 @@ DESCRIPTIONS = st.builds(
     st.none() | st.floats(1e-3, 1e5),
     st.none() | NAMES,
     st.lists(PAIRS, max_size=3).map(tuple),
+    st.none() | st.floats(1e-3, 1e5),
     st.none() | st.floats(0.0, 10.0),
 )
 
@@ -65,6 +66,9 @@ def test_forms_of_the_known_distance(tmp_path: Path, text: str, pairs: list[Know
         ("frame_rate_hz = true", "frame_rate_hz must be a positive number"),
         (f"frame_rate_hz = 0x{'f' * 5000}", "frame_rate_hz must be a positive number"),
         ('frame_rate_hz = "5"', "frame_rate_hz must be a positive number"),
+        ("distance_sigma_m = 0", "distance_sigma_m must be above 0 and below 1e6 metres"),
+        ("distance_sigma_m = nan", "distance_sigma_m must be above 0 and below 1e6 metres"),
+        ("distance_sigma_m = true", "distance_sigma_m must be above 0 and below 1e6 metres"),
         ("calibration_px = -0.1", "calibration_px must lie in 0..10"),
         ("calibration_px = 11", "calibration_px must lie in 0..10"),
         ("calibration_px = nan", "calibration_px must lie in 0..10"),

@@ -42,7 +42,7 @@ def test_what_is_written_reads_back_the_same(
     path = tmp_path_factory.mktemp("round") / "trip"
     names = [f"mav{k}" for k in range(len(instants))]
     pairs = (KnownPair("mav0", "mav1", 2.5),) if len(names) > 1 else ()
-    description = Description("a name", 7.5, names[-1], pairs, 0.25)
+    description = Description("a name", 7.5, names[-1], pairs, 0.03, 0.25)
     sensor = Sensor(CAMERA, FORWARD, 7.5, axes)
     images, truths, imus = {}, {}, {}
     with RecordingWriter(path, description, ImageOptions("png")) as writer:
@@ -62,6 +62,7 @@ def test_what_is_written_reads_back_the_same(
     assert recording.frame_rate_hz == 7.5
     assert recording.leader == names[-1]
     assert recording.known_distances == pairs
+    assert recording.distance_sigma_m == 0.03
     assert recording.calibration_px == 0.25
     for drone, name, at_ns in zip(recording.drones, names, instants, strict=True):
         assert drone.sensor.camera == CAMERA

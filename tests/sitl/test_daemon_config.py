@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl.daemon_config import TRUE_DISTANCE_SIGMA_M, daemon_config, toml_text, with_settings
+from sitl.daemon_config import daemon_config, toml_text, with_settings
 from sitl.plan import FlyOptions, Setting, plan_flight
 from tests.sitl.flights import Flight, write_recording
 from vcl_companion.errors import ConfigError
@@ -50,13 +50,18 @@ def test_a_later_setting_wins_and_the_base_is_left_alone() -> None:
         with_settings(base, [Setting(("log", "level", "deeper"), 1)])
 
 
-@pytest.mark.parametrize(("metres", "told_m"), [(None, TRUE_DISTANCE_SIGMA_M), (2.0, None)])
-def test_a_distance_of_the_truth_s_is_told_as_exact(
-    tmp_path: Path, metres: float | None, told_m: float | None
+@pytest.mark.parametrize("said_m", [None, 0.03])
+@pytest.mark.parametrize(
+    "given", [(), (KnownPair("mav0", "mav1"),), (KnownPair("mav0", "mav1", 2.0),)]
+)
+def test_how_well_its_distances_are_known_is_the_recording_s_to_say(
+    tmp_path: Path, given: tuple[KnownPair, ...], said_m: float | None
 ) -> None:
     recording = read_recording(write_recording(tmp_path / "a", Flight(n_frames=2, n_drones=2)))
-    pair = KnownPair("mav0", "mav1", metres)
-    plan = plan_flight(recording, FlyOptions(known_distances=(pair,)))
+    recording = replace(recording, distance_sigma_m=said_m)
+    plan = plan_flight(recording, FlyOptions(known_distances=given))
+    is_its_own = all(pair.distance_m is None for pair in given)
+    told_m = said_m if is_its_own else None
     config = daemon_config(plan, plan.drones[0], tmp_path / "out", 5001, 5002, 5003, [5004])
     assert config["map"].get("distance_sigma_m") == told_m
 

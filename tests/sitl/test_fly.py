@@ -21,7 +21,6 @@ import pytest
 from click.testing import CliRunner
 
 from sitl.__main__ import main
-from sitl.daemon_config import TRUE_DISTANCE_SIGMA_M
 from tests.whole_lines import json_lines
 from vcl_companion.recording import Description, RecordingWriter, read_recording
 from vcl_companion.recording.tum import read_tum
@@ -52,7 +51,12 @@ def start_of_demo(path: Path) -> Path:
     """Write the first frames of the demo as a recording of its own."""
     demo = read_recording(DEMO)
     description = Description(
-        "start of demo", 5.0, demo.leader, demo.known_distances, demo.calibration_px
+        "start of demo",
+        demo.frame_rate_hz,
+        demo.leader,
+        demo.known_distances,
+        demo.distance_sigma_m,
+        demo.calibration_px,
     )
     with RecordingWriter(path, description) as writer:
         for drone in demo.drones:
@@ -219,7 +223,7 @@ def test_nothing_of_the_truth_reaches_a_daemon(
         shutil.rmtree(blind / name / "state_groundtruth_estimate0")
     distance_m = report_in(flown)["options"]["known_distances_m"]
     known = [f"--known-distance={pair}={metres!r}" for pair, metres in distance_m.items()]
-    known.append(f"--set=map.distance_sigma_m={TRUE_DISTANCE_SIGMA_M}")  # nobody measured them
+    known.append(f"--set=map.distance_sigma_m={read_recording(recording).distance_sigma_m}")
     out = tmp_path / "again"
     done = sitl_fly(blind, "--out", out, "--speed", "max", "--attitude", flown, *known)
     assert done.returncode == 0, done.stderr

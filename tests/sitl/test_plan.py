@@ -27,7 +27,7 @@ def test_all_fly_and_ids_are_their_places(recording: Recording) -> None:
     assert [(d.name, d.system_id) for d in plan.drones] == [("mav0", 1), ("mav1", 2), ("mav2", 3)]
     assert plan.leader == "mav0"
     assert plan.known_distances == ((1, 2, 2.0),)
-    assert not plan.are_distances_true
+    assert plan.are_distances_recorded
     assert plan.starts_at_ns == at_ns(0, 0)
     assert plan.ends_at_ns == at_ns(2, 1)
 
@@ -38,13 +38,14 @@ def test_a_subset_keeps_its_ids_and_gets_a_leader(recording: Recording) -> None:
     assert [(d.name, d.system_id) for d in plan.drones] == [("mav1", 2), ("mav2", 3)]
     assert plan.leader == "mav1"
     assert plan.known_distances == ((2, 3, 4.0),)
+    assert not plan.are_distances_recorded
 
 
 def test_a_distance_without_metres_is_the_truth_s_at_the_start(recording: Recording) -> None:
     options = FlyOptions(known_distances=(KnownPair("mav0", "mav2"),))
     apart = ned_from_body(2, 0).translation - ned_from_body(0, 0).translation
     plan = plan_flight(recording, options)
-    assert plan.are_distances_true
+    assert plan.are_distances_recorded
     ((a, b, distance_m),) = plan.known_distances
     assert (a, b) == (1, 3)
     assert distance_m == pytest.approx(np.linalg.norm(apart), abs=1e-9)
@@ -94,7 +95,7 @@ def test_no_distance_of_who_comes_late_is_known_while_two_others_are_there(
     ((a, b, distance_m),) = plan.known_distances
     assert (a, b) == (1, 3)
     assert distance_m == pytest.approx(apart_m(0, 0, 2, 0), abs=1e-9)
-    assert plan.are_distances_true
+    assert plan.are_distances_recorded
 
 
 def test_instants_that_fit_nothing_are_refused(recording: Recording) -> None:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sitl.render import render_scenario
+from sitl.render import TRUTH_SIGMA_M, render_scenario
 from sitl.renderer import Renderer
 from sitl.scenario import SCENARIOS, Scenario, load_scenario, scenario_names
 from sitl.town import build_town
@@ -186,6 +186,7 @@ def test_a_rendered_scenario_reads_back_and_is_the_same_every_time(tmp_path: Pat
     recording = read_recording(tmp_path / "one")
     assert (recording.name, recording.frame_rate_hz, recording.leader) == ("small", 4.0, "mav0")
     assert [(p.a, p.b, p.distance_m) for p in recording.known_distances] == [("mav0", "mav1", None)]
+    assert recording.distance_sigma_m == TRUTH_SIGMA_M
     assert recording.calibration_px == 0.0
     for drone, told_by in zip(recording.drones, scenario.drone, strict=True):
         assert drone.sensor.camera == scenario.camera.camera()

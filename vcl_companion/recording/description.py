@@ -9,7 +9,14 @@ from pathlib import Path
 
 from vcl_companion.errors import RecordingError
 
-_KEYS = ("name", "frame_rate_hz", "leader", "known_distance", "calibration_px")
+_KEYS = (
+    "name",
+    "frame_rate_hz",
+    "leader",
+    "known_distance",
+    "distance_sigma_m",
+    "calibration_px",
+)
 _MOST_OFF_PX = 10.0
 _PAIR_FORM = 'known_distance must be ["mav0", "mav1"], ["mav0", "mav1", metres] or a list of such'
 
@@ -43,6 +50,8 @@ class Description:
         frame_rate_hz: nominal.
         leader: name of a drone.
         known_distances: pairs of its drones whose distance at the start is known.
+        distance_sigma_m: how well these are known, or the truth that they are taken from, as
+            ``map.distance_sigma_m``.
         calibration_px: what the cameras may be off their calibration, as ``map.calibration_px``;
             0 where they are exact, as rendered ones are.
     """
@@ -51,6 +60,7 @@ class Description:
     frame_rate_hz: float | None = None
     leader: str | None = None
     known_distances: tuple[KnownPair, ...] = ()
+    distance_sigma_m: float | None = None
     calibration_px: float | None = None
 
 
@@ -80,6 +90,9 @@ def read_description(path: Path) -> Description:
     rate_hz = table.get("frame_rate_hz")
     if rate_hz is not None and not (_is_number(rate_hz) and 0.0 < rate_hz < 1e6):
         raise RecordingError(f"{path}: frame_rate_hz must be a positive number below 1e6")
+    sigma_m = table.get("distance_sigma_m")
+    if sigma_m is not None and not (_is_number(sigma_m) and 0.0 < sigma_m < 1e6):
+        raise RecordingError(f"{path}: distance_sigma_m must be above 0 and below 1e6 metres")
     off_px = table.get("calibration_px")
     if off_px is not None and not (_is_number(off_px) and 0.0 <= off_px <= _MOST_OFF_PX):
         raise RecordingError(f"{path}: calibration_px must lie in 0..{_MOST_OFF_PX:.0f}")
@@ -88,6 +101,7 @@ def read_description(path: Path) -> Description:
         frame_rate_hz=None if rate_hz is None else float(rate_hz),
         leader=table.get("leader"),
         known_distances=_known_pairs(path, table.get("known_distance", [])),
+        distance_sigma_m=None if sigma_m is None else float(sigma_m),
         calibration_px=None if off_px is None else float(off_px),
     )
 
@@ -111,6 +125,8 @@ def format_description(description: Description) -> str:
         lines.append(f"known_distance = {pairs[0]}")
     elif pairs:
         lines.append(f"known_distance = [{', '.join(pairs)}]")
+    if description.distance_sigma_m is not None:
+        lines.append(f"distance_sigma_m = {float(description.distance_sigma_m)!r}")
     if description.calibration_px is not None:
         lines.append(f"calibration_px = {float(description.calibration_px)!r}")
     return "".join(line + "\n" for line in lines)

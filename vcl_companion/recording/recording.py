@@ -95,6 +95,7 @@ class Recording:
         leader: name of a drone; the first unless it says otherwise.
         known_distances: pairs of its drones whose distance at the start is known.
         drones: at least one, by rising number.
+        distance_sigma_m: how well these, or the truth, are known; None where it is silent.
         calibration_px: what its cameras may be off their calibration; None where it is silent.
     """
 
@@ -104,6 +105,7 @@ class Recording:
     leader: str
     known_distances: tuple[KnownPair, ...]
     drones: tuple[Drone, ...]
+    distance_sigma_m: float | None = None
     calibration_px: float | None = None
 
     def drone(self, name: str) -> Drone:
@@ -157,6 +159,7 @@ def _read_folder(path: Path) -> Recording:
         leader=description.leader or names[0],
         known_distances=description.known_distances,
         drones=drones,
+        distance_sigma_m=description.distance_sigma_m,
         calibration_px=description.calibration_px,
     )
 
