@@ -13,6 +13,7 @@ from vcl_companion.daemon.map_in_sight import MapInSight
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, quaternion_from_matrix
 from vcl_companion.geometry.similarity import Similarity
+from vcl_companion.geometry.worst_sigma import worst_sigma
 from vcl_companion.links.autopilot_options import Heading
 from vcl_companion.localization.filter_state import FilterState, carried, north_aligned
 from vcl_companion.localization.fix import Localized, NotLocalized, disagreement
@@ -113,7 +114,7 @@ class Estimator:
         state = self._history.newest
         if state is None:
             return math.inf
-        return float(np.sqrt(np.linalg.eigvalsh(state.pose_covariance()[:3, :3])[-1]))
+        return worst_sigma(state.pose_covariance()[:3, :3])
 
     def course(self, ahead_s: float) -> Pose | None:
         """Return where we shall be in so many seconds, flying on and looking as now.
@@ -214,8 +215,8 @@ class Estimator:
 
     def _is_certain(self, state: FilterState) -> bool:
         """Whether a state's position is known as well as a frame has to tell it."""
-        variances = np.linalg.eigvalsh(state.pose_covariance()[:3, :3])
-        return bool(variances[-1] <= self._localization.max_sigma_m**2)
+        sigma_m = worst_sigma(state.pose_covariance()[:3, :3])
+        return sigma_m <= self._localization.max_sigma_m
 
     def take_fix(
         self,

@@ -17,6 +17,7 @@ from vcl_companion.clock import Clock
 from vcl_companion.daemon.estimator import HISTORY_S
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.worst_sigma import worst_sigma
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
 from vcl_companion.wire.frame_codec import FrameAnswer
@@ -280,4 +281,4 @@ class InterTarget:
 
 def _sigma_m(proposal: PoseProposal) -> float:
     """Return the position's 1 sigma in its worst direction, m."""
-    return float(np.sqrt(np.linalg.eigvalsh(proposal.covariance[:3, :3])[-1]))
+    return worst_sigma(proposal.covariance[:3, :3])

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.geometry.similarity import Similarity
+from vcl_companion.geometry.worst_sigma import worst_sigma
 from vcl_companion.localization.filter_state import FilterState, carried
 
 # A fix this old is no more where we are.
@@ -66,7 +65,7 @@ class LastOwnFix:
         metres = float(np.linalg.norm(away))
         since_s = abs(at_ns - own.at_ns) * 1e-9
         spread = own.pose_covariance()[:3, :3] + covariance[:3, :3]
-        sigma_m = math.sqrt(float(np.linalg.eigvalsh(spread)[-1]))
+        sigma_m = worst_sigma(spread)
         reach_m = _FASTEST_SIGMAS * (self._speed_m_s * since_s + sigma_m)
         if metres <= reach_m + _LEAST_AWAY_M:
             return ""

@@ -7,10 +7,9 @@ import math
 from collections import deque
 from collections.abc import Callable
 
-import numpy as np
-
 from vcl_companion.clock import Clock
 from vcl_companion.geometry.rotation import euler_from_matrix, quaternion_from_matrix
+from vcl_companion.geometry.worst_sigma import worst_sigma
 from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.counters import LinkTally
 from vcl_companion.links.fusion import FusionMonitor
@@ -139,7 +138,7 @@ class PoseSender:
         if not is_of_frame:
             self._fusion.sent_between(estimate.at_ns)
             return None
-        sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0))
+        sigma_m = worst_sigma(covariance[:3, :3])
         self._fusion.sent(estimate.at_ns, pose.translation, sigma_m, estimate.n_resets)
         return None
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, euler_from_matrix
+from vcl_companion.geometry.worst_sigma import worst_sigma
 from vcl_companion.localization.localization_options import LocalizationOptions
 
 # With so many landmarks a frame joins the map, though some are lost as its image is encoded: no
@@ -109,7 +110,7 @@ def believed(
     covariance = fix.covariance()
     if not np.all(np.isfinite(covariance)):
         return NotLocalized("the landmarks found do not fix a pose", n_matched, n_inliers)
-    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+    sigma = worst_sigma(covariance[:3, :3])
     if sigma > options.max_sigma_m:
         return NotLocalized(
             f"too uncertain: {sigma:.1f} m, {options.max_sigma_m:.1f} m allowed",

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.relative_attitude import relative_attitude
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.worst_sigma import worst_sigma
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.localization.pair_evidence import (
     Agreement,
@@ -120,7 +121,7 @@ def localize_inter(
         return NoProposal("what both see does not fix the target's pose")
     covariance = covariance + _spread(best, usable)
     covariance = 0.5 * (covariance + covariance.T)
-    sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+    sigma_m = worst_sigma(covariance[:3, :3])
     if not sigma_m <= options.max_sigma_m:
         return NoProposal(f"too uncertain: {sigma_m:.2f} m, {options.max_sigma_m:.2f} m allowed")
     return Proposal(best.world_from_body, covariance, best.n_matches, best.n_common)

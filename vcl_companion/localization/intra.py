@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.worst_sigma import worst_sigma
 from vcl_companion.localization.coverage import covered_share
 from vcl_companion.localization.feature_errors import bias_px, map_error
 from vcl_companion.localization.fix import Localized, NotLocalized, Prior, believed
@@ -126,8 +127,8 @@ class _Matcher:
         if len(z) == 0:
             return float("inf")
         depth = float(np.quantile(z, 0.25))
-        sigma_m = float(np.sqrt(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1]))
-        sigma_rad = float(np.sqrt(np.linalg.eigvalsh(prior.covariance[3:, 3:])[-1]))
+        sigma_m = worst_sigma(prior.covariance[:3, :3])
+        sigma_rad = worst_sigma(prior.covariance[3:, 3:])
         return 3.0 * self.camera.focal_px * float(np.hypot(sigma_m / depth, sigma_rad))
 
     def guided(self, world_from_body: Pose, radius_px: float, max_leverage: float) -> _Matched:

@@ -16,6 +16,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from vcl_companion.geometry.rotation import Array, log_so3, skew
 from vcl_companion.geometry.similarity import Similarity
+from vcl_companion.geometry.worst_sigma import worst_sigma
 from vcl_companion.mapping.common_landmarks import Common
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions, NoMap
@@ -300,11 +301,11 @@ def _doubt(found: Aligned, junior: LandmarkMap, limit_rad: float, options: MapOp
     n, at, covariance = len(found.common.senior), found.senior_from_junior, found.covariance
     if n < MIN_COMMON:
         return f"{n} common landmarks agree, {MIN_COMMON} needed"
-    turn = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+    turn = worst_sigma(covariance[:3, :3])
     bodies = np.array([k.world_from_body.translation for k in junior.keyframes])
     middle = bodies.mean(axis=0)
     back = np.linalg.inv(_to_world(at, middle))
-    sigma_m = float(np.sqrt(np.linalg.eigvalsh((back @ covariance @ back.T)[3:6, 3:6])[-1]))
+    sigma_m = worst_sigma((back @ covariance @ back.T)[3:6, 3:6])
     shown = junior.points_world[found.common.junior]
     depth_m = float(np.median(np.linalg.norm(shown - middle, axis=1)))
     if turn > _MAX_TURN_RAD or sigma_m > options.max_depth_error * at.scale * depth_m:

@@ -8,6 +8,7 @@ import numpy as np
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, log_so3
+from vcl_companion.geometry.worst_sigma import worst_sigma
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.known_features import Index, KeyframeLibrary
 from vcl_companion.mapping.landmark_map import LandmarkMap
@@ -159,8 +160,8 @@ def believed(
     covariance = _covariance(found, kept.a, sure)
     centre = (found.world_from_body @ view.body_from_cam).translation
     depth = float(np.median(np.linalg.norm(known.points_world[kept.a] - centre, axis=1)))
-    sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-    turn = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
+    sigma_m = worst_sigma(covariance[:3, :3])
+    turn = worst_sigma(covariance[3:, 3:])
     if sigma_m > options.max_depth_error * depth or turn > _MAX_TURN_RAD:
         return NotFound(
             f"known to {sigma_m:.1f} m and {np.rad2deg(turn):.1f} degrees only, {depth:.0f} m away"
