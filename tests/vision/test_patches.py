@@ -181,6 +181,24 @@ def test_a_shifted_image_is_found_to_a_few_hundredths(
     assert np.allclose(found.ideal[good], expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("noise", [3.0, 6.0])
+def test_what_noise_of_both_images_makes_patches_err_is_told(noise: float) -> None:
+    """Noise of the keyframe makes gradients of its own, that tell nothing of a shift."""
+    rng = np.random.default_rng(8)
+    clean = cv2.GaussianBlur(painted(rng), (0, 0), 1.0).astype(float) * 0.5 + 64.0
+    keyframe, frame = (
+        np.clip(np.rint(clean + noise * rng.standard_normal(clean.shape)), 0, 255).astype(np.uint8)
+        for _ in range(2)
+    )
+    pixels = rng.uniform(30.0, [610.0, 450.0], (1500, 2))
+    found = aligned(anchored(keyframe, pixels), frame, Pose.identity())
+    good = found.found
+    assert good.sum() > 500
+    error = (found.pixels - found.predicted)[good]
+    sigma = np.sqrt(found.noise[good][:, [0, 2]])
+    assert 0.8 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.1
+
+
 def test_far_predictions_are_searched_at_reduced_resolution() -> None:
     rng = np.random.default_rng(5)
     image = painted(rng)

@@ -31,6 +31,10 @@ _WIDE = SIDE + 2
 _N_PATCH, _N_MARGINED = 112, 128
 # By how much bilinear interpolation reduces the variance of white noise, on average.
 _SMOOTHED = 4.0 / 9.0
+# Noise makes gradients of its own, which tell of no shift. Half of the residual's is the patch's,
+# half of that its central differences'; some of what is taken for texture is some all the same.
+_GRADIENT_NOISE = 0.25
+_LEAST_GRADIENT = 0.25
 # Where a patch's far side is so many times farther than its middle, it is edge on.
 _LEAST_DIVISOR = 0.5
 _LEAST_SHARE = 0.125
@@ -219,6 +223,33 @@ def _compared(
 
 
 @compiled
+def _widen(noises: Array, own: Array, greys: Array, status: Ints) -> None:
+    """Take for texture only what is none of the noise's gradients.
+
+    Solved with those, a patch lies still where their products with the residual are zero, which
+    errs by their share more, and is told as if they helped.
+
+    Args:
+        noises: (M, 3) xx xy yy of the pixels found; widened.
+        own: (M, 2) variance of the shift across and down per variance of a grey level.
+        greys: (M,) variance of the residual's grey levels.
+        status: (M,) FOUND or why not.
+    """
+    found = np.flatnonzero(status == FOUND)
+    if len(found) == 0:
+        return
+    # A quarter of them looks like its patch but for the noise.
+    at = len(found) // 4
+    lost = _GRADIENT_NOISE * SIDE * SIDE * np.partition(greys[found], at)[at]
+    for i in found:
+        more_x = 1.0 / max(1.0 - lost * own[i, 0], _LEAST_GRADIENT)
+        more_y = 1.0 / max(1.0 - lost * own[i, 1], _LEAST_GRADIENT)
+        noises[i, 0] *= more_x * more_x
+        noises[i, 1] *= more_x * more_y
+        noises[i, 2] *= more_y * more_y
+
+
+@compiled
 def align(
     views: Array,
     seen: NDArray[np.bool_],
@@ -264,6 +295,7 @@ def align(
     pixels = np.full((m, 2), np.nan)
     noises, misplaced = np.zeros((m, 3)), np.zeros((m, 3))
     scores, status = np.zeros(m), np.full(m, OUTSIDE)
+    greys, own = np.zeros(m), np.zeros((m, 2))
     patch = np.zeros(_N_PATCH + 2 * _WIDE + 1, np.float32)
     basis = np.empty((3, _N_PATCH), np.float32)
     texels = np.zeros(_N_PATCH + _WIDE + 1, np.float32)
@@ -353,17 +385,18 @@ def align(
         pixels[i, 0], pixels[i, 1] = u * size, v * size
         # Interpolating takes noise away pixel by pixel, and spreads it over the neighbours: what
         # the patch as a whole is off stays. The keyframe's is sampled at all sorts of places.
-        variance = residual / (SIDE * SIDE - 4.0) / (0.5 * (smoothed + _SMOOTHED)) * size * size
+        greys[i] = residual / (SIDE * SIDE - 4.0)
+        own[i, 0], own[i, 1] = inverse[1, 1], inverse[2, 2]
+        variance = greys[i] / (0.5 * (smoothed + _SMOOTHED)) * size * size
         noises[i, 0], noises[i, 1] = variance * inverse[1, 1], variance * inverse[1, 2]
         noises[i, 2] = variance * inverse[2, 2]
         half_angle, octaves = view[15], view[16]
         spread = (
             (rules[4] * size) ** 2 + (2.0 * rules[5] * half_angle) ** 2 + (rules[6] * octaves) ** 2
         )
-        share = rules[7] * rules[7]
-        misplaced[i, 0] = spread + share * noises[i, 0]
-        misplaced[i, 1] = share * noises[i, 1]
-        misplaced[i, 2] = spread + share * noises[i, 2]
+        misplaced[i, 0] = misplaced[i, 2] = spread
+    _widen(noises, own, greys, status)
+    misplaced += rules[7] * rules[7] * noises
     return pixels, noises, misplaced, scores, status
 
 
