@@ -119,8 +119,6 @@ class FlightPlan:
         drones: those that fly, in the recording's order.
         leader: name of the one whose start is the origin.
         known_distances: (system id, system id, m).
-        are_distances_recorded: whether all are the recording's or its truth's: no option gives
-            metres.
         options: how it is flown.
     """
 
@@ -128,8 +126,12 @@ class FlightPlan:
     drones: tuple[PlannedDrone, ...]
     leader: str
     known_distances: tuple[tuple[int, int, float], ...]
-    are_distances_recorded: bool
     options: FlyOptions
+
+    @property
+    def are_distances_recorded(self) -> bool:
+        """Whether no option gives metres: all distances are the recording's or its truth's."""
+        return all(pair.distance_m is None for pair in self.options.known_distances)
 
     @property
     def starts_at_ns(self) -> int:
@@ -218,7 +220,6 @@ def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:
         drones=drones,
         leader=recording.leader if recording.leader in flying else flying[0],
         known_distances=_known_distances(drones, pairs, options.absences),
-        are_distances_recorded=all(pair.distance_m is None for pair in options.known_distances),
         options=options,
     )
     duration_s = (plan.ends_at_ns - plan.starts_at_ns) * 1e-9

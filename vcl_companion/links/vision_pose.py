@@ -21,6 +21,7 @@ import numpy as np
 
 from vcl_companion.geometry.pose import Pose, euler_pose_covariance
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.worst_sigma import worst_sigma
 
 # MAV_AUTOPILOT
 _ARDUPILOT, _PX4 = 3, 12
@@ -105,6 +106,5 @@ def _as_ardupilot_reads(covariance: Array) -> Array:
     total = float(np.trace(position))
     if total <= 0.0:
         return covariance
-    worst = max(float(np.linalg.eigvalsh(position)[-1]), 0.0)
-    scale = np.repeat([np.sqrt(worst / total), 1.0], 3)
+    scale = np.repeat([worst_sigma(position) / np.sqrt(total), 1.0], 3)
     return np.asarray(covariance * np.outer(scale, scale))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +18,12 @@ _KEYS = (
     "distance_sigma_m",
     "calibration_px",
 )
-_MOST_OFF_PX = 10.0
+# Those that are numbers: which will do, and how to say so.
+_NUMBERS: dict[str, tuple[Callable[[float], bool], str]] = {
+    "frame_rate_hz": (lambda hz: 0.0 < hz < 1e6, "be a positive number below 1e6"),
+    "distance_sigma_m": (lambda m: 0.0 < m < 1e6, "be above 0 and below 1e6 metres"),
+    "calibration_px": (lambda px: 0.0 <= px <= 10.0, "lie in 0..10"),
+}
 _PAIR_FORM = 'known_distance must be ["mav0", "mav1"], ["mav0", "mav1", metres] or a list of such'
 
 
@@ -87,22 +93,17 @@ def read_description(path: Path) -> Description:
     for key in ("name", "leader"):
         if key in table and not (isinstance(table[key], str) and table[key].strip()):
             raise RecordingError(f"{path}: {key} must be a text that is not empty")
-    rate_hz = table.get("frame_rate_hz")
-    if rate_hz is not None and not (_is_number(rate_hz) and 0.0 < rate_hz < 1e6):
-        raise RecordingError(f"{path}: frame_rate_hz must be a positive number below 1e6")
-    sigma_m = table.get("distance_sigma_m")
-    if sigma_m is not None and not (_is_number(sigma_m) and 0.0 < sigma_m < 1e6):
-        raise RecordingError(f"{path}: distance_sigma_m must be above 0 and below 1e6 metres")
-    off_px = table.get("calibration_px")
-    if off_px is not None and not (_is_number(off_px) and 0.0 <= off_px <= _MOST_OFF_PX):
-        raise RecordingError(f"{path}: calibration_px must lie in 0..{_MOST_OFF_PX:.0f}")
+    for key, (is_right, form) in _NUMBERS.items():
+        if key in table and not (_is_number(table[key]) and is_right(table[key])):
+            raise RecordingError(f"{path}: {key} must {form}")
+    numbers = {key: float(table[key]) for key in _NUMBERS if key in table}
     return Description(
         name=table.get("name"),
-        frame_rate_hz=None if rate_hz is None else float(rate_hz),
+        frame_rate_hz=numbers.get("frame_rate_hz"),
         leader=table.get("leader"),
         known_distances=_known_pairs(path, table.get("known_distance", [])),
-        distance_sigma_m=None if sigma_m is None else float(sigma_m),
-        calibration_px=None if off_px is None else float(off_px),
+        distance_sigma_m=numbers.get("distance_sigma_m"),
+        calibration_px=numbers.get("calibration_px"),
     )
 
 

@@ -226,8 +226,8 @@ def _compared(
 def _widen(noises: Array, own: Array, greys: Array, status: Ints) -> None:
     """Take for texture only what is none of the noise's gradients.
 
-    Solved with those, a patch lies still where their products with the residual are zero, which
-    errs by their share more, and is told as if they helped.
+    An alignment ends where the products of the patch's gradients with the residual are zero. What
+    of these is noise moves that place, and counts in the normal matrix as if it had fixed it.
 
     Args:
         noises: (M, 3) xx xy yy of the pixels found; widened.
@@ -383,10 +383,10 @@ def align(
         if status[i] != FOUND:
             continue
         pixels[i, 0], pixels[i, 1] = u * size, v * size
-        # Interpolating takes noise away pixel by pixel, and spreads it over the neighbours: what
-        # the patch as a whole is off stays. The keyframe's is sampled at all sorts of places.
         greys[i] = residual / (SIDE * SIDE - 4.0)
         own[i, 0], own[i, 1] = inverse[1, 1], inverse[2, 2]
+        # Interpolating takes noise away pixel by pixel, and spreads it over the neighbours: what
+        # the patch as a whole is off stays. The keyframe's is sampled at all sorts of places.
         variance = greys[i] / (0.5 * (smoothed + _SMOOTHED)) * size * size
         noises[i, 0], noises[i, 1] = variance * inverse[1, 1], variance * inverse[1, 2]
         noises[i, 2] = variance * inverse[2, 2]
