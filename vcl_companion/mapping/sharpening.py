@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from vcl_companion.geometry.camera import Camera
-from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.rotation import Array, log_so3
 from vcl_companion.mapping.apart import ambiguous
 from vcl_companion.mapping.culling import depth_errors, fitting
 from vcl_companion.mapping.landmark_map import LandmarkMap
@@ -26,13 +26,16 @@ from vcl_companion.mapping.weighing import adjust_weighed
 from vcl_companion.vision.bundle import BundleOptions
 from vcl_companion.vision.patches import AlignRules
 
-# A first alignment starts from poses that are some pixels off, the next ones do not.
-_ROUNDS = (
-    AlignRules(max_iterations=15, least_score=0.8, max_moved_px=3.0, settled_px=0.02),
-    AlignRules(max_iterations=15, least_score=0.85, max_moved_px=1.5, settled_px=0.02),
-)
+# A first alignment starts from poses that are some pixels off, the last one does not.
+_LOOSELY = AlignRules(max_iterations=15, least_score=0.8, max_moved_px=3.0, settled_px=0.02)
+_CLOSELY = AlignRules(max_iterations=15, least_score=0.85, max_moved_px=1.5, settled_px=0.02)
+# Patches were turned and stretched by the poses that there were: where these turn by so much, they
+# are measured once more, no more often than so.
+_TURNED_RAD, _MOST_LOOSELY = np.deg2rad(0.5), 3
 # Residuals of patches that are the same spot.
 _MAX_SIGMAS, _LEAST_LIMIT_PX = 4.0, 0.5
+# Along the valley of a scene that is nearly flat an adjustment takes some hundred steps.
+_MAX_STEPS = 400
 _CAUCHY_PX = 0.5
 SETTLED_CAUCHY_PX = 0.15
 """The same for patches measured from poses that are adjusted already.
@@ -61,11 +64,21 @@ def sharpened(
     cameras = [k.camera for k in landmark_map.keyframes]
     images = [(k.image_bytes, k.camera) for k in landmark_map.keyframes]
     table = PatchTable(cameras, pyramids_of(images, pyramid_of))
-    for rules, cauchy_px in zip(_ROUNDS, (_CAUCHY_PX, SETTLED_CAUCHY_PX), strict=True):
-        landmark_map = _round(landmark_map, table, cameras, rules, cauchy_px, options)
+    for _ in range(_MOST_LOOSELY):
+        before = landmark_map
+        landmark_map = _round(before, table, cameras, _LOOSELY, _CAUCHY_PX, options)
         if len(landmark_map.points_world) < options.min_landmarks:
+            return landmark_map
+        if _turned_rad(before, landmark_map) < _TURNED_RAD:
             break
-    return landmark_map
+    return _round(landmark_map, table, cameras, _CLOSELY, SETTLED_CAUCHY_PX, options)
+
+
+def _turned_rad(one: LandmarkMap, other: LandmarkMap) -> float:
+    """Return by how much that keyframe turned that turned most."""
+    pairs = zip(one.keyframes, other.keyframes, strict=True)
+    turns = [log_so3(a.world_from_body.rotation.T @ b.world_from_body.rotation) for a, b in pairs]
+    return float(np.linalg.norm(turns, axis=1).max())
 
 
 def _round(
@@ -111,7 +124,7 @@ def _adjusted(
     landmark_map: LandmarkMap, noise: Array, cauchy_px: float, options: MapOptions
 ) -> LandmarkMap:
     """Adjust a map of patches; leave out what misses by more than patches do."""
-    bundle = BundleOptions(cauchy_px=cauchy_px)
+    bundle = BundleOptions(_MAX_STEPS, cauchy_px)
     views, noise_px = adjust_weighed(views_of(landmark_map), noise, bundle)
     limit_px = max(_MAX_SIGMAS * noise_px, _LEAST_LIMIT_PX)
     fits, good = fitting(views, limit_px, options)
