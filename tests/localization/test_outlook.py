@@ -9,7 +9,7 @@ from tests.localization.painted import BODIES, MOUNTING, carried_on, found_in, p
 from tests.scenes import PINHOLE
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import exp_so3
-from vcl_companion.localization.outlook import held_share, novelty_from
+from vcl_companion.localization.outlook import held_share, novelty_from, share_left
 from vcl_companion.mapping.landmark_map import LandmarkMap
 
 # Back, aside and turned.
@@ -54,3 +54,19 @@ def test_held_is_what_is_in_view_only(landmark_map: LandmarkMap) -> None:
     some = carried_on(landmark_map, 0.4)
     assert held_share(some, THERE @ MOUNTING, PINHOLE) == pytest.approx(0.4, abs=0.05)
     assert held_share(some, AWAY @ MOUNTING, PINHOLE) == 0.0
+
+
+def test_what_is_left_in_view_of_who_turns_away(landmark_map: LandmarkMap) -> None:
+    here = BODIES[0] @ MOUNTING
+
+    def left(turned_deg: float) -> float | None:
+        turned = Pose(exp_so3(np.array([0.0, 0.0, np.deg2rad(turned_deg)])), np.zeros(3))
+        return share_left(landmark_map, here, BODIES[0] @ turned @ MOUNTING, PINHOLE)
+
+    shares = [left(turned_deg) for turned_deg in (0.0, 20.0, 40.0, 180.0)]
+    assert shares[0] == 1.0
+    assert shares[3] == 0.0
+    assert shares[1] is not None
+    assert shares[2] is not None
+    assert 0.1 < shares[2] < shares[1] < 0.9
+    assert share_left(landmark_map, AWAY @ MOUNTING, here, PINHOLE) is None

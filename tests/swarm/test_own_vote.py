@@ -142,6 +142,27 @@ def test_what_looks_ever_newer_is_no_news_on_the_way_to_a_place_that_the_map_kno
     assert [vote.look(FIRST, sight, 4.0 + k * STEP_S) for k, sight in enumerate(here)][-1]
 
 
+@pytest.mark.parametrize(("share", "votes"), [(0.7, False), (0.5, True), (None, False)])
+def test_who_turns_away_from_a_new_map_votes_before_its_loss_is_a_course(
+    share: float | None, votes: bool
+) -> None:
+    asked: list[float] = []
+
+    def ahead(ahead_s: float) -> float | None:
+        asked.append(ahead_s)
+        return share
+
+    vote = OwnVote(OPTIONS, share_ahead=ahead)
+    seen = [vote.look(FIRST, Sight(PLENTY), k * STEP_S) for k in range(10)]
+    assert not any(seen[:2])
+    assert all(voted is votes for voted in seen[2:])
+    assert set(asked) == {OPTIONS.ahead_s}
+    # From then on the landmarks that are seen tell.
+    n_asked = len(asked)
+    assert not [vote.look(FIRST, Sight(PLENTY), 1.0 + k * STEP_S) for k in range(10)][-1]
+    assert len(asked) == n_asked
+
+
 def test_a_vote_stands_until_the_new_map_has_been_seen_for_a_while() -> None:
     vote = OwnVote(OPTIONS)
     for k in range(20):

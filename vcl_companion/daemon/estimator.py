@@ -11,7 +11,7 @@ from vcl_companion.daemon.last_own_fix import FRESH_NS, LastOwnFix
 from vcl_companion.daemon.local_frame import LocalFrame
 from vcl_companion.daemon.map_in_sight import MapInSight
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, quaternion_from_matrix
+from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, quaternion_from_matrix
 from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.geometry.worst_sigma import worst_sigma
 from vcl_companion.links.autopilot_options import Heading
@@ -30,6 +30,8 @@ HISTORY_S = 5.0
 LOST_S = 12.0
 # A frame that has come may be being looked at right now.
 _SETTLE_S = 0.5
+# How we turn is told by so long; it does not go on for ever.
+_TURNED_NS, _FURTHEST_RAD = 330_000_000, np.deg2rad(60.0)
 _LEAST_ARM_M = 1.0
 
 
@@ -126,6 +128,21 @@ class Estimator:
             return None
         pose = state.world_from_body
         return Pose(pose.rotation, pose.translation + ahead_s * state.velocity_world)
+
+    def turning_course(self, ahead_s: float) -> Pose | None:
+        """Return where we shall be in so many seconds, flying and turning on as now.
+
+        By how we turned over the last third of a second; None without a state of then.
+        """
+        there = self.course(ahead_s)
+        newest = self._history.newest
+        before = newest and self._history.before(newest.at_ns - _TURNED_NS)
+        if there is None or newest is None or before is None:
+            return None
+        turned = log_so3(before.world_from_body.rotation.T @ there.rotation)
+        ahead = turned * (1e9 * ahead_s / (newest.at_ns - before.at_ns))
+        furthest = min(1.0, _FURTHEST_RAD / max(float(np.linalg.norm(ahead)), 1e-9))
+        return Pose(there.rotation @ exp_so3(furthest * ahead), there.translation)
 
     def keep_of(self, has_frame: Callable[[int], bool]) -> None:
         """Keep what is believed of frames since the last fix while they are there themselves."""

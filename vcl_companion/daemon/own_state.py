@@ -9,7 +9,7 @@ from vcl_companion.clock import Clock
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.map_store import MapStore
-from vcl_companion.localization.outlook import novelty_from
+from vcl_companion.localization.outlook import novelty_from, share_left
 from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.own_vote import OwnVote, Sight
@@ -61,7 +61,7 @@ class OwnState:
         self._log = log
         self._send = send
         self._sensor = sensor
-        self._vote = OwnVote(options, self._novelty_ahead_deg)
+        self._vote = OwnVote(options, self._novelty_ahead_deg, self._share_ahead)
         self._wants_update = False
         self._wants_since_s = float("-inf")
         self.is_asked_for_update = False
@@ -156,6 +156,14 @@ class OwnState:
             return None
         camera, mounting = self._sensor.camera, self._sensor.body_from_cam
         return novelty_from(stored.index.landmark_map, there @ mounting, camera)
+
+    def _share_ahead(self, ahead_s: float) -> float | None:
+        stored, estimator = self._maps.current, self._estimator
+        here, there = estimator.course(0.0), estimator.turning_course(ahead_s)
+        if stored is None or here is None or there is None:
+            return None
+        camera, mounting = self._sensor.camera, self._sensor.body_from_cam
+        return share_left(stored.index.landmark_map, here @ mounting, there @ mounting, camera)
 
     def _interval_s(self, now_s: float) -> float:
         """How long after the last state the next one is told."""

@@ -60,6 +60,24 @@ def held_share(landmark_map: LandmarkMap, world_from_cam: Pose, camera: Camera) 
     return int(np.count_nonzero(by_oldest)) / max(len(shown), 1)
 
 
+def share_left(landmark_map: LandmarkMap, here: Pose, there: Pose, camera: Camera) -> float | None:
+    """Return how many landmarks lie in an image from there, of as many as do from here, at most 1.
+
+    Args:
+        landmark_map: the map.
+        here: world_from_cam, where it is looked at from.
+        there: where it will be.
+        camera: by whom.
+
+    Returns:
+        None where too few are in view here to tell.
+    """
+    now = len(_in_view(landmark_map, here, camera))
+    if now < _LEAST_LANDMARKS:
+        return None
+    return min(len(_in_view(landmark_map, there, camera)) / now, 1.0)
+
+
 def _in_view(landmark_map: LandmarkMap, world_from_cam: Pose, camera: Camera) -> NDArray[np.intp]:
     """Return the landmarks that lie in an image, hidden by others or not."""
     # A peer's pose and camera are bounded, and may be nonsense.

@@ -5,7 +5,8 @@ the median of its last second, or, of the first three, will hold when an update,
 there (``foresight``):
 
 * landmarks in sight < max(``tracked``, ``share`` x most since this revision, of which no more
-  than ``enough`` count: a pose is found by a few hundred, and is hardly better by more);
+  than ``enough`` count: a pose is found by a few hundred, and is hardly better by more); of a
+  new map, which nobody has seen for long enough to foresee anything, by where its landmarks lie;
 * covered share of the image < min(``covered``, 0.8 x most since this revision), the former
   less by the root of how many times ``enough`` landmarks are in sight: these make up for it.
   Sky is never covered, and no reason to update again and again;
@@ -91,6 +92,8 @@ class OwnVote:
         options: what it goes by.
         novelty_ahead_deg: how new the map will look where the drone is in so many seconds, if
             it flies on as it does; None where nobody can tell.
+        share_ahead: what will be in sight then, of as much as is now, if it turns on as well;
+            likewise.
 
     Attributes:
         options: what it goes by; may be changed.
@@ -101,9 +104,11 @@ class OwnVote:
         self,
         options: UpdateOptions,
         novelty_ahead_deg: Callable[[float], float | None] = lambda ahead_s: None,
+        share_ahead: Callable[[float], float | None] = lambda ahead_s: None,
     ) -> None:
         self.options = options
         self._novelty_ahead_deg = novelty_ahead_deg
+        self._share_ahead = share_ahead
         self._update_time = UpdateTime()
         self._best = _Best(b"", 0.0)
         self._seen: deque[tuple[float, Sight]] = deque()
@@ -195,7 +200,19 @@ class OwnVote:
         seen = [(at_s, float(s.tracked)) for at_s, s in self._seen]
         lately = statistics.median_high(n for _, n in seen)
         self._best.tracked = max(self._best.tracked, lately)
-        return min(lately, self._foreseen(seen, lately)) < self._least()
+        least = self._least()
+        return min(lately, self._foreseen(seen, lately)) < least or self._turns_away(lately, least)
+
+    def _turns_away(self, lately: float, least: float) -> bool:
+        """Whether little of a new map will be in sight, by where its landmarks lie.
+
+        Its window is too short for a course yet, and who turns may be past it before.
+        """
+        now_s, _ = self._seen[-1]
+        if now_s >= self._best.since_s + _WINDOW_S:
+            return False
+        share = self._share_ahead(self._ahead_s)
+        return share is not None and share * lately < least
 
     def _is_narrow(self) -> bool:
         known = [(at_s, s.covered) for at_s, s in self._seen if s.covered is not None]
