@@ -31,7 +31,7 @@ _LOOSELY = AlignRules(max_iterations=15, least_score=0.8, max_moved_px=3.0, sett
 _CLOSELY = AlignRules(max_iterations=15, least_score=0.85, max_moved_px=1.5, settled_px=0.02)
 # Patches were turned and stretched by the poses that there were: where these turn by so much, they
 # are measured once more, no more often than so.
-_TURNED_RAD, _MOST_LOOSELY = np.deg2rad(0.5), 3
+_TURNED_RAD, _MOST_LOOSELY = np.deg2rad(1.0), 3
 # Residuals of patches that are the same spot.
 _MAX_SIGMAS, _LEAST_LIMIT_PX = 4.0, 0.5
 # Along the valley of a scene that is nearly flat an adjustment takes some hundred steps.
