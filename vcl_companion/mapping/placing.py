@@ -18,7 +18,7 @@ from vcl_companion.mapping.patch_table import PatchTable, Reference
 from vcl_companion.mapping.tracks import PairMatches
 from vcl_companion.mapping.uncertainty import MapUncertainty
 from vcl_companion.vision.patches import AlignRules
-from vcl_companion.vision.resection import NotFound, ResectionOptions, Sightings, refine
+from vcl_companion.vision.resection import NotFound, ResectionOptions, Sightings, Undecided, refine
 
 _MIN_INLIERS = 20
 # So many landmarks fix a pose; all of them are looked for once that is known.
@@ -132,7 +132,10 @@ def place(
             poses = [*worlds_from_cams, *[pose @ view.body_from_cam] * (table.n_views - n_known)]
             found = table.found(reference, poses, [column], look.rules, look.reach_px, look.level)
             at = found.pixels[:, column]
-            result = _judged(view, pose, landmarks, at, known, sure, look.noise_px, options)
+            is_near = looks is _NEAR
+            result = _judged(
+                view, pose, landmarks, at, known, sure, look.noise_px, options, is_near=is_near
+            )
             if isinstance(result, NotFound):
                 break
             pose = result.world_from_body
@@ -148,12 +151,20 @@ def _judged(
     sure: MapUncertainty,
     noise_px: float,
     options: MapOptions,
+    *,
+    is_near: bool,
 ) -> Placed | NotFound:
-    """Return where (M, 2) pixels of landmarks, NaN where not found, put a view."""
+    """Return where (M, 2) pixels of landmarks, NaN where not found, put a view.
+
+    ``is_near``: these were looked for within a few pixels of where the view says that it was
+    taken. Then none of them can be far off, not even one that decides the pose.
+    """
     hit = np.flatnonzero(np.isfinite(found[:, 0]))
     links = PairMatches(landmarks[hit], np.arange(len(hit), dtype=np.intp))
     sightings = _sightings(view, links.a, found[hit], known, sure, noise_px)
     refined = refine(pose, sightings, ResectionOptions(min_inliers=_MIN_INLIERS))
+    if is_near and isinstance(refined, Undecided):
+        refined = refined.found
     checked = believed(view, links, refined, known, sure, options)
     if isinstance(checked, NotFound):
         return checked
