@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, orthonormalized
+from vcl_companion.geometry.rotation import Array, angle_between, exp_so3, orthonormalized
 
 Task = Literal["relative", "resection"]
 Shape = Literal["planar", "relief"]
@@ -145,7 +145,7 @@ def _twin(homography: Array, truth: Pose, a: Array, b: Array) -> Pose | None:
             orthonormalized(np.asarray(rotation)),
             np.asarray(translation, dtype=np.float64).reshape(3),
         )
-        turn = float(np.linalg.norm(log_so3(truth.rotation.T @ pose.rotation)))
+        turn = angle_between(truth.rotation, pose.rotation)
         if turn > 1e-3 and _share_in_front(pose, a, b) > _TWIN_IN_FRONT:
             return pose
     return None

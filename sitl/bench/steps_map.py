@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 from sitl.bench.inputs import FEATURES, Inputs
 from sitl.bench.timing import Accuracy, Entry
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, right_jacobian_so3
+from vcl_companion.geometry.rotation import Array, angle_between, exp_so3, right_jacobian_so3
 from vcl_companion.localization.fix import Localized, NotLocalized, Prior
 from vcl_companion.localization.intra import localize_intra
 from vcl_companion.localization.localization_options import LocalizationOptions
@@ -114,7 +114,7 @@ def localization(inputs: Inputs) -> list[Entry]:
         if found is None:
             return Accuracy("not localized", False)
         offset = float(np.linalg.norm(found.translation - truth.translation))
-        turn = float(np.rad2deg(np.linalg.norm(log_so3(found.rotation.T @ truth.rotation))))
+        turn = float(np.rad2deg(angle_between(found.rotation, truth.rotation)))
         right = offset < _RIGHT_M and turn < _RIGHT_DEG
         return Accuracy(f"{turn:.3f} deg, {1e3 * offset:.1f} mm", right)
 

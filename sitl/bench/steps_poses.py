@@ -16,7 +16,7 @@ from sitl.bench.inputs import Inputs
 from sitl.bench.robust import THRESHOLD_PX
 from sitl.bench.timing import Accuracy, Entry
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, skew
+from vcl_companion.geometry.rotation import Array, angle_between, exp_so3, log_so3, skew
 from vcl_companion.vision.absolute_pose import ResectionProblem, resect
 from vcl_companion.vision.acransac import NotFound
 from vcl_companion.vision.hartley_sturm import corrected_matches
@@ -175,7 +175,7 @@ def _judge_absolute(truth: Pose, limit_m: float, poses: list[Pose]) -> Accuracy:
 
 
 def _turn_deg(one: Pose, other: Pose) -> float:
-    return float(np.rad2deg(np.linalg.norm(log_so3(one.rotation.T @ other.rotation))))
+    return float(np.rad2deg(angle_between(one.rotation, other.rotation)))
 
 
 def _vector(pose: Pose) -> Array:

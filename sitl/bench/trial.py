@@ -16,7 +16,7 @@ import numpy as np
 from sitl.bench.cases import FOCAL_PX, Case, Cell, Task, case_of
 from sitl.bench.contenders import Contender
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import log_so3
+from vcl_companion.geometry.rotation import angle_between
 from vcl_companion.vision.absolute_pose import ResectionProblem
 from vcl_companion.vision.relative_pose import RelativePoseProblem
 
@@ -92,7 +92,7 @@ def _asked(
 
 def _errors(task: Task, pose: Pose, truth: Pose) -> tuple[float, float]:
     """Return the rotation error, deg, and that of the direction, deg, or of the position, m."""
-    turn = float(np.linalg.norm(np.rad2deg(log_so3(pose.rotation.T @ truth.rotation))))
+    turn = float(np.rad2deg(angle_between(pose.rotation, truth.rotation)))
     if task == "resection":
         offset = pose.inverse().translation - truth.inverse().translation
         return turn, float(np.linalg.norm(offset))

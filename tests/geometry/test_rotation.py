@@ -8,6 +8,7 @@ from tests.checks import numeric_jacobian
 from tests.scenes import random_rotation
 from vcl_companion.geometry.rotation import (
     Array,
+    angle_between,
     euler_from_matrix,
     euler_jacobian,
     exp_so3,
@@ -44,6 +45,17 @@ def test_exp_is_scipys_rotation(vector: Array) -> None:
 @given(turns(np.pi - 1e-6))
 def test_log_undoes_exp(vector: Array) -> None:
     np.testing.assert_allclose(log_so3(exp_so3(vector)), vector, rtol=0, atol=1e-9)
+
+
+@given(turns(np.pi), turns(np.pi - 1e-6))
+def test_the_angle_between_two_rotations_is_that_of_what_leads_from_one_to_the_other(
+    first: Array, vector: Array
+) -> None:
+    one = exp_so3(first)
+    other = one @ exp_so3(vector)
+    angle_rad = pytest.approx(np.linalg.norm(vector), abs=1e-7)
+    assert angle_between(one, other) == angle_rad
+    assert angle_between(other, one) == angle_rad
 
 
 @pytest.mark.parametrize("axis", [np.eye(3)[0], np.eye(3)[1], np.eye(3)[2], np.ones(3) / 3**0.5])

@@ -16,7 +16,7 @@ from vcl_companion.daemon.check_host import Check
 from vcl_companion.daemon.check_motion import Motion
 from vcl_companion.daemon.swapped_axes import Windows, swapped_axes
 from vcl_companion.geometry.hand_eye import AxesFit, fit_axes, turned_about
-from vcl_companion.geometry.rotation import Array, log_so3
+from vcl_companion.geometry.rotation import Array, angle_between
 
 _OFF_DEG = 20.0
 # So much has to be turned about a second axis for the mounting, about a third for its handedness.
@@ -112,7 +112,7 @@ def _windows(motion: Motion, late_s: float, least_deg: float) -> Windows:
         start, end = motion.said_at(start_ns - late_ns), motion.said_at(end_ns - late_ns)
         if start is None or end is None:
             continue
-        size_rad = max(np.linalg.norm(turn), np.linalg.norm(log_so3(start.T @ end)))
+        size_rad = max(np.linalg.norm(turn), angle_between(start, end))
         if size_rad >= np.deg2rad(least_deg):
             seen.append(turn)
             starts.append(start)
@@ -143,7 +143,7 @@ def _of_windows(windows: Windows, fit: AxesFit, body_from_cam: Array, *, is_time
         what = f"not judged: what the camera sees and the autopilot says do not fit; {turned}"
         advice = "a scene that stands still and is metres away, slower turns; whose attitude is it?"
         return Check("axes", "warning", what, advice)
-    off_deg = float(np.rad2deg(np.linalg.norm(log_so3(fit.rotation @ body_from_cam.T))))
+    off_deg = _apart_deg(fit.rotation, body_from_cam)
     if off_deg <= _OFF_DEG:
         what = f"{mounting_text(body_from_cam)}; seen {off_deg:.0f} degrees from that"
         return Check("axes", "ok", what)
@@ -177,7 +177,7 @@ def _likely_mounting(body_from_cam: Array) -> tuple[float, float, float]:
 
 
 def _apart_deg(a: Array, b: Array) -> float:
-    return float(np.rad2deg(np.linalg.norm(log_so3(a.T @ b))))
+    return float(np.rad2deg(angle_between(a, b)))
 
 
 def _is_mirror_image(seen: Array, configured: Array) -> bool:

@@ -134,10 +134,11 @@ class Estimator:
 
         By how we turned over the last third of a second; None without a state of then.
         """
-        there = self.course(ahead_s)
-        newest = self._history.newest
-        before = newest and self._history.before(newest.at_ns - _TURNED_NS)
-        if there is None or newest is None or before is None:
+        there, newest = self.course(ahead_s), self._history.newest
+        if there is None or newest is None:
+            return None
+        before = self._history.before(newest.at_ns - _TURNED_NS)
+        if before is None:
             return None
         turned = log_so3(before.world_from_body.rotation.T @ there.rotation)
         ahead = turned * (1e9 * ahead_s / (newest.at_ns - before.at_ns))

@@ -40,6 +40,11 @@ def log_so3(rotation: Array) -> Array:
     return np.asarray(angle / sine * q[1:])
 
 
+def angle_between(one: Array, other: Array) -> float:
+    """Return by how much two (3, 3) rotations are turned against each other, rad, 0 to pi."""
+    return float(np.linalg.norm(log_so3(one.T @ other)))
+
+
 def right_jacobian_so3(rotation_vector: Array) -> Array:
     """Return the (3, 3) J with Exp(v + d) ~ Exp(v) Exp(J d)."""
     angle = float(np.linalg.norm(rotation_vector))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, log_so3
+from vcl_companion.geometry.rotation import Array, angle_between
 from vcl_companion.localization.contradictions import reconciled
 from vcl_companion.localization.filter_state import (
     N_OWN,
@@ -203,7 +203,7 @@ def _turned_squared(state: FilterState, ned_from_body: Array) -> float:
     before = state.ned_from_body if state.ned_from_body is not None else ned_from_body
     origin = state.fixed_attitude if state.fixed_attitude is not None else before
     had, has, step = (
-        float(np.linalg.norm(log_so3(a.T @ b)))
+        angle_between(a, b)
         for a, b in ((origin, before), (origin, ned_from_body), (before, ned_from_body))
     )
     return max(has**2 - had**2, step**2)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from vcl_companion.geometry.rotation import Array, log_so3, skew
+from vcl_companion.geometry.rotation import Array, angle_between, skew
 from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.geometry.worst_sigma import worst_sigma
 from vcl_companion.mapping.common_landmarks import Common
@@ -227,7 +227,7 @@ def _apart(pairs: _Pairs, agree: Mask, one: Similarity, other: Similarity) -> bo
     centre = points.mean(axis=0)
     size_m = one.scale * float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean()))
     moved_m = float(np.linalg.norm(one.apply(centre) - other.apply(centre)))
-    turned = float(np.linalg.norm(log_so3(one.rotation.T @ other.rotation)))
+    turned = angle_between(one.rotation, other.rotation)
     return moved_m > _APART * size_m or turned > _APART_RAD
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, log_so3
+from vcl_companion.geometry.rotation import Array, angle_between
 from vcl_companion.geometry.worst_sigma import worst_sigma
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.known_features import Index, KeyframeLibrary
@@ -135,7 +135,7 @@ def contradiction(view: DroneView, world_from_body: Pose, options: MapOptions) -
     sigma = np.deg2rad(options.attitude_sigma_deg)
     turn = 0.0
     if view.has_heading:
-        turn = float(np.linalg.norm(log_so3(world_from_body.rotation.T @ view.ned_from_body)))
+        turn = angle_between(world_from_body.rotation, view.ned_from_body)
     vertical = float(world_from_body.rotation[2] @ view.ned_from_body[2])
     tilt = float(np.arccos(np.clip(vertical, -1.0, 1.0)))
     if tilt > 3.0 * sigma or turn > 3.0 * _HEADING_FACTOR * sigma:

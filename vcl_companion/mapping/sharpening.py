@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from vcl_companion.geometry.camera import Camera
-from vcl_companion.geometry.rotation import Array, log_so3
+from vcl_companion.geometry.rotation import Array, angle_between
 from vcl_companion.mapping.apart import ambiguous
 from vcl_companion.mapping.culling import depth_errors, fitting
 from vcl_companion.mapping.landmark_map import LandmarkMap
@@ -77,8 +77,9 @@ def sharpened(
 def _turned_rad(one: LandmarkMap, other: LandmarkMap) -> float:
     """Return by how much that keyframe turned that turned most."""
     pairs = zip(one.keyframes, other.keyframes, strict=True)
-    turns = [log_so3(a.world_from_body.rotation.T @ b.world_from_body.rotation) for a, b in pairs]
-    return float(np.linalg.norm(turns, axis=1).max())
+    return max(
+        angle_between(a.world_from_body.rotation, b.world_from_body.rotation) for a, b in pairs
+    )
 
 
 def _round(

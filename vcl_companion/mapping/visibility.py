@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.relative_attitude import RelativeAttitude, relative_attitude
-from vcl_companion.geometry.rotation import Array, log_so3
+from vcl_companion.geometry.rotation import Array, angle_between
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.tracks import PairMatches
@@ -86,7 +86,7 @@ def choose_hypothesis(
 
 def _degrees_apart(one: Pose, other: Pose) -> tuple[float, float]:
     """Return the angle between two rotations and the one between two unit translations."""
-    turn = float(np.linalg.norm(log_so3(one.rotation.T @ other.rotation)))
+    turn = angle_between(one.rotation, other.rotation)
     cosine = float(np.clip(one.translation @ other.translation, -1.0, 1.0))
     return float(np.rad2deg(turn)), float(np.rad2deg(np.arccos(cosine)))
 

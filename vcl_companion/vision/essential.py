@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, skew
+from vcl_companion.geometry.rotation import Array, angle_between, exp_so3, skew
 from vcl_companion.vision.acransac import AcRansacOptions
 from vcl_companion.vision.epipolar import signed_sampson
 from vcl_companion.vision.information import robust_sigma
@@ -193,6 +193,6 @@ def _judged(
 
 
 def _same(one: Pose, other: Pose) -> bool:
-    turn = float(np.linalg.norm(log_so3(one.rotation.T @ other.rotation)))
+    turn = angle_between(one.rotation, other.rotation)
     cosine = float(np.clip(one.translation @ other.translation, -1.0, 1.0))
     return bool(turn < np.deg2rad(0.3) and cosine > np.cos(np.deg2rad(1.5)))
