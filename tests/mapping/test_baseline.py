@@ -89,6 +89,29 @@ def test_the_length_is_that_of_most_landmarks(n_wrong: int) -> None:
     np.testing.assert_array_equal(agree, np.flatnonzero(both) >= n_wrong)
 
 
+@pytest.mark.parametrize("n_right", [0, 19])
+def test_wrong_matches_on_lines_that_the_image_cuts_short_tell_no_length(n_right: int) -> None:
+    # A camera that leaves behind nearly all that is mapped, over ground of which one spot looks
+    # like another: a landmark is matched with what lies on its line inside the image.
+    rng = np.random.default_rng(4)
+    aside, length = Pose(np.eye(3), np.array([1.0, 0.0, 0.0])), 12.0
+    points = rng.uniform([-5.0, -4.0, 8.0], [8.0, 4.0, 9.0], (150, 3))
+    points[:n_right, 0] = rng.uniform(-8.0, -5.0, n_right)
+    room = CAMERA.width_px / 2 / CAMERA.focal_px - points[:, 0] / points[:, 2]
+    shift = rng.uniform(0.0, np.maximum(room, 0.02))
+    shift[:n_right] = length / points[:n_right, 2]
+    seen = points[:, :2] / points[:, 2:]
+    seen[:, 0] += shift
+    found = with_length(aside, points, seen, CAMERA, MapOptions())
+    if n_right:
+        assert not isinstance(found, NotFound)
+        assert np.linalg.norm(found[0].translation) == pytest.approx(length, rel=0.01)
+        assert found[1][:n_right].all()
+    else:
+        assert isinstance(found, NotFound)
+        assert "agree on how long" in found.reason
+
+
 def test_landmarks_that_contradict_each_other_give_no_length() -> None:
     rng = np.random.default_rng(2)
     aside = Pose(np.eye(3), np.array([1.0, 0.0, 0.0]))

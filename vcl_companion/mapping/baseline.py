@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import bdtrc
+from scipy.special import rel_entr
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
@@ -25,6 +25,8 @@ Mask = NDArray[np.bool_]
 _LEAST = 6
 # So many lengths on which as many agree are expected of wrong matches alone.
 _BY_CHANCE = 1e-4
+# How long baselines are looked at, of a landmark's distance, and at how many steps.
+_LONGEST, _STEPS = 3.0, 100
 
 
 def with_length(
@@ -63,52 +65,68 @@ def with_length(
     tried = lengths[telling]
     if len(tried) < _LEAST:
         return NotFound(f"{len(tried)} landmarks tell how long the baseline is, {_LEAST} needed")
-    focal_px = camera_b.focal_px
-    agree = np.array([_agree(s, b_from_a, turned, ideal_b, focal_px, limit_px) for s in tried])
-    best = agree[np.argmax(agree.sum(axis=1))]
+    agree, visible = _at_lengths(tried, b_from_a, turned, ideal_b, camera_b, limit_px)
+    windows = _windows(b_from_a, turned, camera_b, limit_px)
+    by_chance = _by_chance(agree, visible, windows)
+    chosen = int(np.argmin(by_chance))
+    best = agree[chosen][telling]
     n = int(best.sum())
-    windows = _windows(b_from_a, turned[telling], camera_b, limit_px)
-    if n < _LEAST or _by_chance(n, windows) > _BY_CHANCE:
+    if n < _LEAST or by_chance[chosen] > np.log(_BY_CHANCE):
         return NotFound(f"{n} of {len(tried)} landmarks agree on how long the baseline is")
-    length = float(np.median(lengths[best]))
-    vague = robust_sigma(lengths[best] - length) / np.sqrt(n) / length
+    length = float(np.median(tried[best]))
+    vague = robust_sigma(tried[best] - length) / np.sqrt(n) / length
     if vague > options.max_depth_error:
         return NotFound(f"{n} landmarks tell how long the baseline is to {100 * vague:.0f} % only")
-    agreeing = _agree(length, b_from_a, turned, ideal_b, focal_px, limit_px)
-    return Pose(b_from_a.rotation, length * b_from_a.translation), agreeing
+    only = np.array([length])
+    agreeing, _ = _at_lengths(only, b_from_a, turned, ideal_b, camera_b, limit_px)
+    return Pose(b_from_a.rotation, length * b_from_a.translation), agreeing[0]
 
 
-def _by_chance(n: int, windows: Array) -> float:
-    """Return on how many of their lengths so many of M landmarks agree if all are wrong.
+def _by_chance(agree: Mask, visible: Mask, windows: Array) -> Array:
+    """Return on how many lengths so many landmarks agree if all are wrong, as (L,) logarithms.
 
-    Each agrees with its own probability, one of (M,) windows; as many with the mean of these do so
-    no less often (W. Hoeffding, On the distribution of the number of successes in independent
-    trials, 1956).
+    Whom a length puts outside the image cannot agree on it. Of the others each agrees with its
+    own probability, one of (M,) windows; as many with the mean of these do so no less often,
+    and no more often than the bound says (W. Hoeffding, On the distribution of the number of
+    successes in independent trials, 1956; Probability inequalities for sums of bounded random
+    variables, 1963, eq. 2.1). Who tells a length agrees on it in any case.
     """
-    n_all = len(windows)
-    return n_all * float(bdtrc(n - 2, n_all - 1, windows.mean()))
+    may = agree | visible
+    n_may = np.maximum(may.sum(axis=1), 1)
+    expected = may @ windows / n_may
+    share = np.maximum((agree.sum(axis=1) - 1) / np.maximum(n_may - 1, 1), expected)
+    apart = rel_entr(share, expected) + rel_entr(1.0 - share, 1.0 - expected)
+    return np.asarray(np.log(len(windows)) - (n_may - 1) * apart)
 
 
 def _windows(b_from_a: Pose, turned: Array, camera_b: Camera, limit_px: float) -> Array:
     """Return (M,) what part of a landmark's epipolar line agrees with any one length.
 
-    The line runs from where the landmark is without a baseline to the epipole, or out of the
-    image: half of its diagonal, as a rule.
+    Only the part of the line that the image shows holds matches, wrong ones too: of what a
+    camera leaves behind most is short, and wrong matches there agree on a short baseline.
     """
-    out_px = 0.5 * float(np.hypot(camera_b.width_px, camera_b.height_px))
-    towards = b_from_a.translation
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ends = turned[:, :2] / turned[:, 2:] - towards[:2] / towards[2]
-        line_px = np.linalg.norm(ends, axis=1) * camera_b.focal_px
-    ends_inside = (turned[:, 2] > 0.0) & (towards[2] > 0.0) & (line_px < out_px)
-    line_px = np.where(ends_inside, line_px, out_px)
+    distance = np.linalg.norm(turned, axis=1)
+    line_px, before = np.zeros(len(turned)), np.full((len(turned), 2), np.nan)
+    for share in np.linspace(0.0, _LONGEST, _STEPS):
+        pixels = camera_b.project(turned + (share * distance)[:, None] * b_from_a.translation)
+        pixels[~camera_b.shows(pixels, 0.0)] = np.nan
+        step_px = np.linalg.norm(pixels - before, axis=1)
+        line_px += np.where(np.isfinite(step_px), step_px, 0.0)
+        before = pixels
     return np.asarray(np.minimum(1.0, 2.0 * limit_px / np.maximum(line_px, limit_px)))
 
 
-def _agree(
-    length: float, b_from_a: Pose, turned: Array, ideal_b: Array, focal_px: float, limit_px: float
-) -> Mask:
-    points = turned + length * b_from_a.translation
-    with np.errstate(divide="ignore", invalid="ignore"):
-        error = np.linalg.norm(points[:, :2] / points[:, 2:] - ideal_b, axis=1) * focal_px
-    return np.asarray((points[:, 2] > 0.0) & (error < limit_px))
+def _at_lengths(
+    lengths: Array, b_from_a: Pose, turned: Array, ideal_b: Array, camera_b: Camera, limit_px: float
+) -> tuple[Mask, Mask]:
+    """Return (L, M) who agrees on each length, and whom it puts inside the image."""
+    agree = np.zeros((len(lengths), len(turned)), dtype=bool)
+    visible = np.zeros_like(agree)
+    for k, length in enumerate(lengths):
+        points = turned + length * b_from_a.translation
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off = points[:, :2] / points[:, 2:] - ideal_b
+        error_px = np.linalg.norm(off, axis=1) * camera_b.focal_px
+        agree[k] = (points[:, 2] > 0.0) & (error_px < limit_px)
+        visible[k] = camera_b.shows(camera_b.project(points), 0.0)
+    return agree, visible
