@@ -25,8 +25,9 @@ Mask = NDArray[np.bool_]
 _LEAST = 6
 # So many lengths on which as many agree are expected of wrong matches alone.
 _BY_CHANCE = 1e-4
-# How long baselines are looked at, of a landmark's distance, and at how many steps.
-_LONGEST, _STEPS = 3.0, 100
+# How long a baseline may be, of the distance to the scene; epipolar lines are followed in steps.
+LONGEST = 3.0
+_STEPS = 100
 
 
 def with_length(
@@ -65,7 +66,8 @@ def with_length(
     tried = lengths[telling]
     if len(tried) < _LEAST:
         return NotFound(f"{len(tried)} landmarks tell how long the baseline is, {_LEAST} needed")
-    agree, visible = _at_lengths(tried, b_from_a, turned, ideal_b, camera_b, limit_px)
+    looks = [_at_length(s, b_from_a, turned, ideal_b, camera_b, limit_px) for s in tried]
+    agree, visible = np.array(looks).swapaxes(0, 1)
     windows = _windows(b_from_a, turned, camera_b, limit_px)
     by_chance = _by_chance(agree, visible, windows)
     chosen = int(np.argmin(by_chance))
@@ -77,9 +79,8 @@ def with_length(
     vague = robust_sigma(tried[best] - length) / np.sqrt(n) / length
     if vague > options.max_depth_error:
         return NotFound(f"{n} landmarks tell how long the baseline is to {100 * vague:.0f} % only")
-    only = np.array([length])
-    agreeing, _ = _at_lengths(only, b_from_a, turned, ideal_b, camera_b, limit_px)
-    return Pose(b_from_a.rotation, length * b_from_a.translation), agreeing[0]
+    agreeing, _ = _at_length(length, b_from_a, turned, ideal_b, camera_b, limit_px)
+    return Pose(b_from_a.rotation, length * b_from_a.translation), agreeing
 
 
 def _by_chance(agree: Mask, visible: Mask, windows: Array) -> Array:
@@ -107,7 +108,7 @@ def _windows(b_from_a: Pose, turned: Array, camera_b: Camera, limit_px: float) -
     """
     distance = np.linalg.norm(turned, axis=1)
     line_px, before = np.zeros(len(turned)), np.full((len(turned), 2), np.nan)
-    for share in np.linspace(0.0, _LONGEST, _STEPS):
+    for share in np.linspace(0.0, LONGEST, _STEPS):
         pixels = camera_b.project(turned + (share * distance)[:, None] * b_from_a.translation)
         pixels[~camera_b.shows(pixels, 0.0)] = np.nan
         step_px = np.linalg.norm(pixels - before, axis=1)
@@ -116,17 +117,13 @@ def _windows(b_from_a: Pose, turned: Array, camera_b: Camera, limit_px: float) -
     return np.asarray(np.minimum(1.0, 2.0 * limit_px / np.maximum(line_px, limit_px)))
 
 
-def _at_lengths(
-    lengths: Array, b_from_a: Pose, turned: Array, ideal_b: Array, camera_b: Camera, limit_px: float
+def _at_length(
+    length: float, b_from_a: Pose, turned: Array, ideal_b: Array, camera_b: Camera, limit_px: float
 ) -> tuple[Mask, Mask]:
-    """Return (L, M) who agrees on each length, and whom it puts inside the image."""
-    agree = np.zeros((len(lengths), len(turned)), dtype=bool)
-    visible = np.zeros_like(agree)
-    for k, length in enumerate(lengths):
-        points = turned + length * b_from_a.translation
-        with np.errstate(divide="ignore", invalid="ignore"):
-            off = points[:, :2] / points[:, 2:] - ideal_b
-        error_px = np.linalg.norm(off, axis=1) * camera_b.focal_px
-        agree[k] = (points[:, 2] > 0.0) & (error_px < limit_px)
-        visible[k] = camera_b.shows(camera_b.project(points), 0.0)
-    return agree, visible
+    """Return (M,) who agrees on a length, and whom it puts inside the image."""
+    points = turned + length * b_from_a.translation
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = points[:, :2] / points[:, 2:] - ideal_b
+    error_px = np.linalg.norm(off, axis=1) * camera_b.focal_px
+    agree = np.asarray((points[:, 2] > 0.0) & (error_px < limit_px))
+    return agree, camera_b.shows(camera_b.project(points), 0.0)

@@ -12,7 +12,7 @@ import numpy as np
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.mapping.baseline import with_length
+from vcl_companion.mapping.baseline import LONGEST, with_length
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.growth import view_of
 from vcl_companion.mapping.joining import Joined, contradiction
@@ -26,7 +26,7 @@ from vcl_companion.vision.guided_pairs import match_epipolar
 from vcl_companion.vision.resection import NotFound
 
 # How long a baseline may be, of the distance to the scene: least and largest.
-_BASELINES = (1e-3, 3.0)
+_BASELINES = (1e-3, LONGEST)
 
 
 def join_to_keyframe(
