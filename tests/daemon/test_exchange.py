@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -43,9 +44,9 @@ async def one_thing_later(stranger: Stranger, system_id: int, number: int) -> No
     assert (await stranger.answer())[1].request_id == number
 
 
-def later(system_id: int, frame: Frame) -> Frame:
+def later(system_id: int, frame: Frame, by_s: float = 0.1) -> Frame:
     """The same picture a moment later."""
-    return Frame(frame.image, frame.captured_at_ns + 100_000_000, frame.sequence + 1, 0)
+    return Frame(frame.image, frame.captured_at_ns + int(by_s * 1e9), frame.sequence + 1, 0)
 
 
 def test_three_drones_make_one_map_and_all_fly_on_it(tmp_path: Path) -> None:
@@ -88,6 +89,33 @@ def test_a_refusal_reaches_everybody_and_a_newer_frame_is_tried(tmp_path: Path) 
             await one.see(later(1, demo.frame(1)))
             await two.maps.decided()
             assert one.revision == two.revision != b""
+
+    run(scenario())
+
+
+@pytest.mark.parametrize(("by_s", "warned"), [(0.1, 0), (9.0, 0), (42.0, 1)])
+def test_a_first_map_long_after_its_first_try_warns_of_its_scale(
+    tmp_path: Path, by_s: float, warned: int
+) -> None:
+    """Known distances are of when it was tried first: the drones may have flown off since."""
+
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            one, two = await members.start(1), await members.start(2)
+            told = asyncio.create_task(two.maps.decided())
+            await one.see(demo.frame(1))
+            await two.see(demo.frame(2, image=demo.blank(2)))
+            assert await told is None
+            await two.see(later(2, demo.frame(2), by_s))
+            await one.see(later(1, demo.frame(1), by_s))
+            await two.maps.decided()  # handed out, after which it is not long until it is noted
+            assert one.revision == two.revision != b""
+            await until(lambda: len(one.events("late first map")) >= warned)
+            late = one.events("late first map")
+            assert len(late) == warned
+            assert all("tried for 42 s" in reason for reason in late)
+            said = [await one.autopilot.texts.get() for _ in range(warned)]
+            assert all(text == "VCL scale unsure: first map tried for 42 s" for text in said)
 
     run(scenario())
 

@@ -176,7 +176,15 @@ class Exchange:
             estimator.carry,
             lambda: self._rounds.is_under_way,
         )
-        self.results = RoundResults(group, maps, self._sharing.own_maps, self._outbox.send, log)
+        self.results = RoundResults(
+            group,
+            maps,
+            self._sharing.own_maps,
+            self._outbox.send,
+            log,
+            autopilot.announce,
+            clock,
+        )
         self._rounds = MapRounds(
             group,
             self.frames,

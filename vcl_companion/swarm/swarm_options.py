@@ -17,7 +17,7 @@ class SwarmOptions:
     Attributes:
         members: system ids of all drones; empty for a drone alone.
         leader: one of them; 0 for the lowest.
-        known_distances: (a, b, m): distance between two drones at the start, m.
+        known_distances: (a, b, m): distance between two drones when the first map is made, m.
         heartbeat_timeout_s: silent for this long is lost; in a large swarm for longer (``pace``).
         leader_wait_s: how long a leader that was never heard is waited for; then the others
             make a world of their own.
