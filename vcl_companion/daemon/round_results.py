@@ -77,8 +77,9 @@ class RoundResults:
 
     def _note_first_map(self) -> None:
         """Warn where a first map came late: its scale is of distances that may be over by now."""
-        since_ns = self._tried_since_ns
-        waited_ns = 0 if since_ns is None else self._clock.now_ns() - since_ns
+        if self._tried_since_ns is None:
+            return
+        waited_ns = self._clock.now_ns() - self._tried_since_ns
         if waited_ns < _LONG_TRIED_NS:
             return
         waited = f"{waited_ns / 1e9:.0f} s"
@@ -97,8 +98,7 @@ class RoundResults:
             _log.warning("no update of the map: %s", reason)
             return
         # Known distances are those of drones that are there.
-        are_there = set(self._group.measured) <= set(self._group.teammates)
-        if self._tried_since_ns is None and are_there:
+        if self._tried_since_ns is None and set(self._group.measured) <= set(self._group.teammates):
             self._tried_since_ns = self._clock.now_ns()
         if reason != self._maps.refusal:
             self._log.event("no map", reason)
