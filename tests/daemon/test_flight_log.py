@@ -112,14 +112,45 @@ def test_the_report_reads_it(tmp_path: Path) -> None:
     assert read.summary.refusals == {"fog": 2}
 
 
-def test_an_earlier_flight_is_replaced_and_nothing_follows_the_summary(tmp_path: Path) -> None:
+def test_nothing_follows_the_summary(tmp_path: Path) -> None:
     path = tmp_path / "flight.jsonl"
-    path.write_text("an earlier flight")
     log = FlightLog(str(path), ManualClock())
     log.close(**SUMMARY)
     log.event("late", "a thread that ends after us")
     log.close(**SUMMARY)
     assert [line["kind"] for line in lines(path)] == ["summary"]
+
+
+def test_earlier_flights_are_kept_beside_it(tmp_path: Path) -> None:
+    path = tmp_path / "flight.jsonl"
+    for n in range(23):
+        log = FlightLog(str(path), ManualClock())
+        log.event("flight", str(n))
+        log.close(**SUMMARY)
+    kept = {file.name: lines(file)[0]["reason"] for file in tmp_path.iterdir()}
+    earlier = {f"flight.jsonl.{back}": str(22 - back) for back in range(1, 21)}
+    assert kept == {"flight.jsonl": "22", **earlier}
+
+
+def test_one_that_says_nothing_is_not_kept(tmp_path: Path) -> None:
+    path = tmp_path / "flight.jsonl"
+    path.touch()
+    FlightLog(str(path), ManualClock()).close(**SUMMARY)
+    assert [file.name for file in tmp_path.iterdir()] == ["flight.jsonl"]
+
+
+def test_where_an_earlier_flight_cannot_be_moved_this_one_follows_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "flight.jsonl"
+    FlightLog(str(path), ManualClock()).close(**SUMMARY)
+    (tmp_path / "flight.jsonl.19").touch()
+    (tmp_path / "flight.jsonl.20").mkdir()  # in the way, and nothing to be removed as a file
+    log = FlightLog(str(path), ManualClock())
+    log.event("again", "")
+    log.close(**SUMMARY)
+    assert [line["kind"] for line in lines(path)] == ["summary", "event", "summary"]
+    assert "goes on where it was" in caplog.text
 
 
 def test_without_a_file_it_still_counts() -> None:

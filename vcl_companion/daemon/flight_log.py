@@ -7,6 +7,7 @@ import logging
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
+from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import IO, Literal
 
@@ -33,13 +34,16 @@ _UPPER = np.triu_indices(6)
 # Reasons hold numbers, and some are a peer's words: beyond so many they share one count.
 _MAX_REASONS = 200
 _OTHER_REASONS = "other reasons"
+# Of earlier runs: a daemon that fails again and again is started again every twenty seconds.
+_MOST_KEPT = 20
 
 
 class FlightLog:
     """Writes one line per frame, event and map; counts frames even when no file is kept.
 
     Args:
-        path: the file, replaced when it exists; empty for none.
+        path: the file, empty for none. What earlier runs wrote there is kept beside it: the last
+            one's as ``path.1``, the one's before as ``path.2``, to ``path.20``.
         clock: stamps events.
 
     Raises:
@@ -54,7 +58,8 @@ class FlightLog:
         if path:
             try:
                 Path(path).parent.mkdir(parents=True, exist_ok=True)
-                self._file = open(path, "w", encoding="utf-8", buffering=1)  # noqa: SIM115 kept open
+                _keep_earlier(path)
+                self._file = open(path, "a", encoding="utf-8", buffering=1)  # noqa: SIM115 kept open
             except (OSError, ValueError) as error:
                 why = getattr(error, "strerror", None) or error
                 raise ConfigError(f"[log] flight_log {path!r}: {why}") from error
@@ -185,3 +190,20 @@ class FlightLog:
         if file is not None:
             with suppress(OSError):  # it tries once more to write what it could not
                 file.close()
+
+
+def _keep_earlier(path: str) -> None:
+    """Move what an earlier run has written aside: after a crash in flight it is what tells why.
+
+    Where it cannot be moved this run's lines follow it: a restart in the air fails by nothing here.
+    """
+    # No device, and no folder, is moved.
+    if not (Path(path).is_file() and Path(path).stat().st_size):
+        return
+    earlier = RotatingFileHandler(path, backupCount=_MOST_KEPT, delay=True)
+    try:
+        earlier.doRollover()
+    except OSError as error:
+        _log.warning("[log] flight_log %r goes on where it was: %s", path, error.strerror)
+    finally:
+        earlier.close()
