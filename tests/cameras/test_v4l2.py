@@ -1,6 +1,6 @@
 import asyncio
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +51,39 @@ class Device:
         self._film.release()
 
 
+class Shaky:
+    """A device that says what it is told to: a grey level, no image, or OpenCV's error."""
+
+    def __init__(self, says: Sequence[int | cv2.error | None]) -> None:
+        self._says = iter(says)
+        self.released = False
+
+    def read(self) -> tuple[bool, Any]:
+        said = next(self._says, None)
+        if isinstance(said, cv2.error):
+            raise said
+        return said is not None, None if said is None else np.full(SIZE_PX[::-1], said, np.uint8)
+
+    def get(self, prop: int, /) -> float:
+        return SystemClock().now_ns() * 1e-6
+
+    def release(self) -> None:
+        self.released = True
+
+
 def camera_of(capture: Callable[[], Capture], offset_s: float = 0.0) -> V4l2Camera:
-    return V4l2Camera("film", capture, SIZE_PX, offset_s, SystemClock())
+    return V4l2Camera("film", capture, SIZE_PX, offset_s, SystemClock(), patience_s=0.1)
+
+
+async def levels_of(camera: V4l2Camera, n_frames: int) -> list[int]:
+    """Return the grey levels of a camera's first frames."""
+    out = []
+    async for frame in camera.frames():
+        out.append(int(frame.image[0, 0]))
+        if len(out) == n_frames:
+            break
+    await camera.close()
+    return out
 
 
 def test_frames_carry_the_device_s_time_and_the_offset(tmp_path: Path) -> None:
@@ -65,7 +96,7 @@ def test_frames_carry_the_device_s_time_and_the_offset(tmp_path: Path) -> None:
         for _ in LEVELS:
             may_read.release()
             seen.append(await anext(frames))
-        may_read.release()
+        may_read.release(1000)  # however often it is asked again
         with pytest.raises(DeviceError, match=r"^camera film: stopped sending frames$"):
             await anext(frames)
         await camera.close()
@@ -81,11 +112,78 @@ def test_frames_carry_the_device_s_time_and_the_offset(tmp_path: Path) -> None:
     assert device.released
 
 
+def test_an_image_that_cannot_be_decoded_is_left_out() -> None:
+    async def scenario() -> list[int]:
+        may_go_on = threading.Semaphore(0)
+
+        class Paced(Shaky):
+            def read(self) -> tuple[bool, Any]:
+                may_go_on.acquire()
+                return super().read()
+
+        device = Paced([30, None, cv2.error("a buffer of no bytes"), 90])
+        camera = camera_of(lambda: device)
+        frames = camera.frames()
+        may_go_on.release()
+        first = await anext(frames)
+        may_go_on.release(3)
+        second = await anext(frames)
+        may_go_on.release(100)
+        await camera.close()
+        assert [first.sequence, second.sequence] == [0, 1]
+        return [int(frame.image[0, 0]) for frame in (first, second)]
+
+    assert asyncio.run(scenario()) == [30, 90]
+
+
+def test_a_device_that_stops_is_opened_again(caplog: pytest.LogCaptureFixture) -> None:
+    devices = [Shaky([30]), None, Shaky([]), Shaky([90])]
+    opened: list[Shaky | None] = []
+
+    def open_next() -> Capture:
+        opened.append(devices[len(opened)])
+        if opened[-1] is None:
+            raise DeviceError("camera film: no such device")
+        return opened[-1]
+
+    assert asyncio.run(levels_of(camera_of(open_next), 2)) == [30, 90]
+    assert [device.released for device in devices if device is not None] == [True] * 3
+    assert [record.message for record in caplog.records] == [
+        f"camera film: {why}; opening it again"
+        for why in ("stopped sending frames", "no such device", "stopped sending frames")
+    ]
+
+
+def test_a_device_that_is_gone_for_good_ends_the_frames() -> None:
+    n_opened = 0
+
+    def open_next() -> Capture:
+        nonlocal n_opened
+        n_opened += 1
+        return Shaky([30] if n_opened == 1 else [])
+
+    with pytest.raises(DeviceError, match=r"^camera film: stopped sending frames$"):
+        asyncio.run(levels_of(camera_of(open_next), 2))
+    assert n_opened == 5
+
+
+def test_a_device_that_never_gives_a_frame_is_opened_once() -> None:
+    opened: list[Shaky] = []
+
+    def open_next() -> Capture:
+        opened.append(Shaky([]))
+        return opened[-1]
+
+    with pytest.raises(DeviceError, match=r"^camera film: stopped sending frames$"):
+        asyncio.run(levels_of(camera_of(open_next), 1))
+    assert len(opened) == 1
+
+
 def test_the_newest_frame_wins(tmp_path: Path) -> None:
-    path = video(tmp_path)
+    film = cv2.VideoCapture(str(video(tmp_path)))
 
     async def scenario() -> list[int]:
-        camera = camera_of(lambda: cv2.VideoCapture(str(path)))
+        camera = camera_of(lambda: film)
         frames = camera.frames()
         waiting = asyncio.ensure_future(anext(frames))
         await asyncio.sleep(0)  # starts the reader
@@ -125,14 +223,17 @@ def test_a_step_back_of_the_device_s_clock_is_a_dropped_frame(tmp_path: Path) ->
     device = Device(video(tmp_path), (0.0, 1.0, 0.0, 0.0), may_read)
 
     async def scenario() -> list[int]:
-        frames = camera_of(lambda: device).frames()
+        camera = camera_of(lambda: device)
+        frames = camera.frames()
         may_read.release()
         first = await anext(frames)
         may_read.release(2)
-        return [first.sequence, (await anext(frames)).sequence]
+        second = await anext(frames)
+        may_read.release(10)
+        await camera.close()
+        return [first.sequence, second.sequence]
 
     assert asyncio.run(scenario()) == [0, 2]
-    may_read.release(10)
 
 
 def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:

@@ -118,6 +118,25 @@ def test_a_frame_that_the_map_has_already_is_not_given_again(tmp_path: Path) -> 
     run(scenario())
 
 
+def test_keyframes_of_before_a_reboot_are_no_newer_than_any_frame(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with lost(tmp_path) as up:
+            stored = up.maps.current
+            assert stored is not None
+            known = stored.index.landmark_map
+            old = tuple(
+                replace(k, drone_id=DRONE, captured_at_ns=at_ns(LOST[-1]) + 10**12)
+                for k in known.keyframes
+            )
+            index = replace(stored.index, landmark_map=replace(known, keyframes=old))
+            up.maps.replace(stored.data, index)
+            frame = await chosen(up).of(at_ns(LOST[-1]))
+            assert frame is not None
+            assert frame.captured_at_ns == at_ns(FOUND[-1])
+
+    run(scenario())
+
+
 @pytest.mark.parametrize("k", [0, 1])
 def test_without_a_map_it_is_the_frame_of_the_instant(tmp_path: Path, k: int) -> None:
     async def scenario() -> None:

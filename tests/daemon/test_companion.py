@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from sitl.frame_server import FrameServer
 from tests.daemon import demo
@@ -43,6 +44,7 @@ from vcl_companion.geometry.rotation import matrix_from_euler, quaternion_from_m
 from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
+from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.map_index import index_map
@@ -50,7 +52,7 @@ from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.mapping.agreement import moved_to
-from vcl_companion.mapping.templates import prepare_templates
+from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.pose_requests import HostChoice, InterMavOptions
 from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
@@ -363,6 +365,50 @@ def test_what_was_looked_at_in_a_world_that_was_left_is_looked_at_again(tmp_path
     run(scenario())
 
 
+class Doubting(Odometry):
+    """Has every frame looked at by our own last ones too, which tell no more."""
+
+    def __init__(self, up: Flight) -> None:
+        super().__init__(demo.sensor(DRONE), DRONE, MapWork(up.shop, forks=False))
+        self.is_asked: Callable[[], object] = lambda: None
+
+    @property
+    def templates(self) -> Templates:
+        return demo.templates(1, 2, 3)
+
+    def may_tell_more(self, on_map: Localized | NotLocalized) -> bool:
+        self.is_asked()
+        return True
+
+    def tells_more(self, own: Localized, on_map: Localized | NotLocalized) -> bool:
+        return False
+
+
+def test_a_world_that_is_left_while_own_frames_are_looked_at_is_left(tmp_path: Path) -> None:
+    join = in_another_world()
+
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            up.companion._own_fixes._odometry = doubting = Doubting(up)
+            executor, looks = up.executor, threading.Barrier(2)
+            for k in range(6):
+                up.give(k)
+                if k == 3:
+                    doubting.is_asked = lambda: executor.submit(looks.wait, 20.0)
+                    await until(lambda: looks.n_waiting == executor._work_queue.qsize() == 1)
+                    doubting.is_asked = lambda: None
+                    join(up)
+                    looks.wait(20.0)
+                await up.server.answered()
+                pose = await up.autopilot.poses.get()
+                truth = demo.world_from_body(DRONE, k).translation
+                assert np.linalg.norm(np.array(pose[1:4]) - truth) < 0.1
+            assert [outcome for _, outcome, _ in up.frames()] == ["localized"] * 6
+
+    run(scenario())
+
+
 def test_what_was_searched_in_a_world_that_was_left_is_searched_again(tmp_path: Path) -> None:
     join = in_another_world()
 
@@ -380,6 +426,47 @@ def test_what_was_searched_in_a_world_that_was_left_is_searched_again(tmp_path: 
             assert state is not None
             there = demo.world_from_body(DRONE, 0).translation + np.array([20.0, -8.0, 0.0])
             assert np.linalg.norm(state.world_from_body.translation - there) < 0.1
+
+    run(scenario())
+
+
+def test_what_peers_said_is_not_told_when_its_world_is_left_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    join = in_another_world()
+
+    async def scenario() -> None:
+        async with flight(tmp_path) as up:
+            up.fly_on_a_map()
+            stored = up.maps.current
+            assert stored is not None
+            coming = asyncio.ensure_future(anext(up.outcomes._camera.frames()))
+            await up.server.connected()
+            up.give(0)
+            frame = await coming
+            up.outcomes.opened(frame)
+            shot, revision = demo.shot(DRONE, 0), stored.revision
+            asked = Asked(1, frame, shot.ned_from_body.rotation, revision, np.inf, {1}, [])
+            before = AskedPeers(
+                asked, weakref.ref(stored), stored.world, np.zeros((1, 3)), NotLocalized("fog")
+            )
+            there = demo.world_from_body(DRONE, 0)
+            said = PoseProposal.of(1, revision, there, 1e-4 * np.eye(6))
+
+            async def hear(asked_peers: AskedPeers) -> FilterState | None:
+                return up.peer_poses.fuse(1, said, asked_peers)
+
+            monkeypatch.setattr(up.peer_poses, "hear", hear)
+            executor, looks = up.executor, threading.Barrier(2)
+            executor.submit(looks.wait, 20.0)
+            hearing = asyncio.create_task(up.companion._hear_peers(before))
+            await until(lambda: looks.n_waiting == executor._work_queue.qsize() == 1)
+            join(up)
+            looks.wait(20.0)
+            await hearing
+            told = "peers told a place in a world that was left since"
+            assert up.frames() == [(0, "refused", told)]
+            assert up.autopilot.poses.empty()
 
     run(scenario())
 

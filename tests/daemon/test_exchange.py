@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.daemon import demo
-from tests.daemon.swarm import DATA, MESSAGE, Drone, Stranger, said, swarm, tunnel
+from tests.daemon.swarm import DATA, MESSAGE, Drone, said, swarm, tunnel
 from tests.daemon.waiting import hurry, run, until
 from tests.wire.samples import small_map
 from vcl_companion.cameras.source import Frame
@@ -38,10 +38,10 @@ def asked_more(drone: Drone) -> Callable[[], bool]:
     return lambda: len(drone.requests) > n_before
 
 
-async def one_thing_later(stranger: Stranger, system_id: int, number: int) -> None:
-    """Wait until a drone has done what it was doing beside its event loop: that goes in turn."""
-    stranger.say(FrameRequest(number, 0, 0.0), system_id)
-    assert (await stranger.answer())[1].request_id == number
+async def one_thing_later(drone: Drone) -> None:
+    """Wait until a drone has done what was said to it, and one thing beside its event loop."""
+    await asyncio.sleep(0.05)
+    await drone.work.encode(demo.shot(drone.system_id).image, 40, 1 << 20)
 
 
 def later(system_id: int, frame: Frame, by_s: float = 0.1) -> Frame:
@@ -176,9 +176,9 @@ def test_who_has_not_said_yet_what_it_flies_on_is_waited_for(tmp_path: Path) -> 
             one, two = await members.start(1), await members.stranger(2)
             await two.meets(1)
             await one.see(demo.frame(1))
-            for k in range(3):  # seconds in which it could begin a round
+            for _ in range(3):  # seconds in which it could begin a round
                 hurry(1.0)
-                await one_thing_later(two, 1, k)
+                await one_thing_later(one)
             assert not any(isinstance(message, FrameRequest) for message in two.heard())
             two.say(NO_MAP, 1)
             assert (await two.asked()).frame_age_s == 0.0
@@ -196,8 +196,8 @@ def test_a_map_that_turns_up_during_a_round_ends_it(tmp_path: Path) -> None:
             asked = await two.asked()
             two.say(MapState(revision_of(TRIO), 9, True), 1)
             two.hand(BlobKind.FRAME_ANSWER, encode_frame(demo.answer(2, 0, asked.request_id)), 1)
-            for k in range(5):  # the round has all it wants, and ends
-                await one_thing_later(two, 1, k)
+            for _ in range(5):  # the round has all it wants, and ends
+                await one_thing_later(one)
             assert (one.revision, one.maps.refusal) == (b"", "")
             two.hand(BlobKind.MAP, TRIO, 1)
             await one.maps.decided()
@@ -290,6 +290,24 @@ def test_a_flood_of_requests_piles_nothing_up(tmp_path: Path) -> None:
             one.say(FrameRequest(6000, 0, 0.0), 2)
             assert (await one.answer())[1].request_id == 6000
             assert one.blobs.empty()
+
+    run(scenario())
+
+
+def test_who_does_not_coordinate_is_given_no_frame(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            two = await members.start(2)
+            one, three = await members.stranger(1), await members.stranger(3)
+            await one.meets(2)
+            await three.meets(2)
+            await two.see(demo.frame(2))
+            three.say(FrameRequest(7, 0, 0.0), 2)
+            kind = "a frame asked for by who does not coordinate"
+            await until(counted(two, kind, 1))
+            one.say(FrameRequest(6, 0, 0.0), 2)
+            assert (await one.answer())[1].request_id == 6
+            assert three.blobs.empty()
 
     run(scenario())
 

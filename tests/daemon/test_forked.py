@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,17 @@ class UnportableError(Exception):
 
     def __init__(self, first: int, second: int) -> None:
         super().__init__(f"{first} and {second}")
+
+
+def _no_memory() -> object:
+    raise MemoryError
+
+
+class TooMuch:
+    """There is no memory for it where it arrives."""
+
+    def __reduce__(self) -> tuple[Callable[[], object], tuple[()]]:
+        return _no_memory, ()
 
 
 class Shop:
@@ -76,6 +87,9 @@ class Shop:
             except OSError:  # the listing's own
                 continue
         return found
+
+    def too_much(self) -> object:
+        return TooMuch()
 
     def terminate_self(self) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
@@ -135,6 +149,13 @@ def test_who_asks_a_lost_process_is_told_so(shop: Forked) -> None:
         waiting.result(WITHIN_S)
     with pytest.raises(ProcessLostError):
         shop.call("one", "count").result(WITHIN_S)
+
+
+def test_who_cannot_read_what_comes_back_has_lost_the_process(shop: Forked) -> None:
+    asked = shop.call("one", "wait"), shop.call("other", "too_much")
+    for call in asked:
+        with pytest.raises(ProcessLostError):
+            call.result(WITHIN_S)
 
 
 def test_it_leaves_signals_and_files_to_its_parent(shop: Forked, tmp_path: Path) -> None:

@@ -85,6 +85,35 @@ def test_who_says_where_it_was_may_show_an_earlier_instant_in_an_update(is_updat
     run(scenario())
 
 
+def test_more_frames_than_were_asked_for_are_refused_whatever_their_number() -> None:
+    async def scenario() -> None:
+        group, clock = Group(SwarmOptions((1, 2, 3)), 1), ManualClock(NOW_NS)
+        clocks = PeerClocks(group, lambda *_: None, clock, FlightLog("", clock), lambda *_: None, 0)
+        for peer in (2, 3):
+            group.heartbeat(peer, asyncio.get_running_loop().time())
+        asked: list[int] = []
+        gathering = Gathering(
+            group, lambda _, peer: asked.append(peer), clock, clocks, np.random.default_rng(0)
+        )
+        first = gathering.begin()
+        frames: list[FrameAnswer] = []
+
+        async def gather() -> None:
+            frames.extend(await gathering.gather(Wanted(NOW_NS, (2, 3), timeout_s=2.0), bool))
+
+        async with asyncio.TaskGroup() as round_:
+            round_.create_task(gather())
+            await until(lambda: sorted(asked) == [2, 3])
+            said = [
+                gathering.take(2, answer((first + n) % (1 << 32), 0.1 * n, is_placed=False))
+                for n in range(20)
+            ]
+        assert said == [None] + ["frame nobody asked for"] * 19
+        assert len(frames) == 1
+
+    run(scenario())
+
+
 def test_a_frame_that_answers_for_several_instants_counts_once() -> None:
     async def scenario() -> None:
         wanted = Wanted(

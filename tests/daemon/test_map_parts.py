@@ -12,8 +12,10 @@ from scipy.spatial import cKDTree
 from tests.daemon import demo
 from tests.daemon.swarm import INTER, Drone, Swarm, swarm
 from tests.daemon.waiting import computed, passes, run, until
-from vcl_companion.daemon.map_offer import MapOffer, ready_map
-from vcl_companion.daemon.map_store import StoredMap
+from vcl_companion.daemon.map_offer import HandOut, MapOffer, ready_map
+from vcl_companion.daemon.map_parts import MapParts
+from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.workshop import Workshop
 from vcl_companion.mapping.uncertainty import map_uncertainty
 from vcl_companion.swarm.group import SwarmOptions
@@ -91,6 +93,16 @@ def test_part_and_rest_are_the_whole_and_no_longer() -> None:
     assert (whole.data, whole.contradicts, whole.part_of) == (WHOLE, "", b"")
     with pytest.raises(ValueError, match="not in use here"):
         ready_map(offer, None, "akaze", demo.FEATURES, made._memory, False, {})
+
+
+def test_who_is_on_a_part_of_another_is_sent_none_of_ours() -> None:
+    work = MapWork(workshop(), forks=False)
+    parts = MapParts(MapStore(""), work, lambda *_: 0, QUICK_BYTES)
+    ours = HandOut(REVISION, decode_map(WHOLE).parent, WHOLE, b"")
+    assert not parts.comes_first(3, ours, is_on_part=True)
+    assert parts.rest_for(3, ours, 0.0, is_on_part=True) == b""
+    assert parts.comes_first(4, ours, is_on_part=False)
+    work.end()
 
 
 def test_who_comes_late_flies_on_a_part_and_then_on_the_whole(tmp_path: Path) -> None:

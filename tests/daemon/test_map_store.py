@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from pathlib import Path
 
 import pytest
@@ -74,6 +75,24 @@ def test_every_revision_is_kept_whole(tmp_path: Path) -> None:
     names = {f"{revision_of(data).hex()}.vclmap" for data in (DATA, other)}
     assert {path.name for path in directory.iterdir()} == names
     assert (directory / f"{revision_of(DATA).hex()}.vclmap").read_bytes() == DATA
+
+
+def test_the_oldest_revisions_go_when_there_is_no_room_for_them(tmp_path: Path) -> None:
+    maps = MapStore(str(tmp_path), kept_bytes=2 * len(DATA))
+    old = [tmp_path / f"{k:016x}.vclmap" for k in range(3)]
+    others = [tmp_path / name for name in ("saved.vclmap", "mine.vclmap", "0123.vclmap")]
+    for k, path in enumerate((*old, *others)):
+        path.write_bytes(bytes(len(DATA) // 2))
+        os.utime(path, ns=(k, k))
+    maps.keep(maps.replace(DATA, INDEX))
+    left = {old[1], old[2], *others, tmp_path / f"{revision_of(DATA).hex()}.vclmap"}
+    assert set(tmp_path.iterdir()) == left
+
+
+def test_the_newest_revision_stays_however_large_it_is(tmp_path: Path) -> None:
+    maps = MapStore(str(tmp_path), kept_bytes=1)
+    maps.keep(maps.replace(DATA, INDEX))
+    assert [path.name for path in tmp_path.iterdir()] == [f"{revision_of(DATA).hex()}.vclmap"]
 
 
 def test_a_full_disk_leaves_no_half_map_and_the_flight_goes_on(

@@ -70,6 +70,21 @@ def test_a_jump_within_the_poses_own_error_is_made_nothing_of(mode: ResetMode) -
     assert drone.said == [("a jump within the pose's own error: nothing is made of it", False)]
 
 
+def test_a_jump_back_during_a_slide_ends_it() -> None:
+    drone = Drone("blend")
+    drone.tells(pose())
+    drone.jumps(pose(5.0), pose())  # a false place
+    told = pose()
+    for _ in range(10):
+        slid = drone.tells(pose(5.0))
+        assert slid is not None
+        told = slid
+    assert told.translation[0] < 1.0
+    assert_at(drone.jumps(pose(0.1), told), pose(0.1))  # where the autopilot takes it to be
+    assert_at(drone.tells(pose(0.1)), pose(0.1))
+    assert drone.resets.n_resets == 0
+
+
 @pytest.mark.parametrize("vehicle", [LANDED, LOITER])
 @pytest.mark.parametrize("mode", ["follow", "blend", "wait"])
 def test_a_larger_one_is_a_reset_where_nothing_flies_to_positions(

@@ -104,6 +104,16 @@ def test_a_disk_that_fails_does_not_end_the_flight(
     ]
 
 
+def test_a_disk_that_is_full_keeps_no_restart_from_flying_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    last = kept(tmp_path, Clocks()).signing.time.next(Clocks().now())
+    (tmp_path / "state" / ".x.json.partial").symlink_to("/dev/full")
+    again = kept(tmp_path, Clocks())
+    assert again.signing.time.next(Clocks().now()) > last
+    assert "No space left on device" in caplog.text
+
+
 def test_a_folder_that_cannot_be_written_is_told_before_the_flight(tmp_path: Path) -> None:
     (tmp_path / "state").write_text("a file")
     with pytest.raises(ConfigError, match=r"x\.json: "):

@@ -137,6 +137,18 @@ def test_a_tunnel_for_another_component_is_refused() -> None:
     assert refusals(data) == {"tunnel for another component": 1}
 
 
+def test_of_a_datagram_of_nothing_but_magic_numbers_few_checksums_are_reckoned() -> None:
+    refused = refusals(b"\xfe" * 65_000)
+    assert 0 < refused["wrong checksum"] < 100
+    assert refused["garbage bytes"] > 60_000
+    refused = refusals(b"\xfd\xff" * 32_000)
+    assert 0 < refused["unknown incompatibility flags"] < 100
+    # What damage makes of some frames does not hide the next.
+    ours, _ = codec()
+    damaged = b"".join(wire.tunnel(bytes([k]) * 120, system=2)[:-1] + b"x" for k in range(5))
+    assert ours.decode_datagram(damaged + wire.heartbeat()) == [decoded(wire.heartbeat())]
+
+
 def test_refusals_name_their_reason() -> None:
     good = wire.heartbeat()
     assert refusals(good[:-1] + bytes([good[-1] ^ 1])) == {"wrong checksum": 1, "garbage bytes": 20}

@@ -33,6 +33,16 @@ def test_of_like_views_two_suffice_the_first_ones(alike: LandmarkMap) -> None:
     assert without_alike((3, 1, 2), alike, ()) == (3, 1)
 
 
+def test_the_newest_is_the_last_one_whatever_a_restarted_clock_says(alike: LandmarkMap) -> None:
+    *before, last = alike.keyframes
+    restarted = replace(alike, keyframes=(*before, replace(last, captured_at_ns=0)))
+    observed = restarted.observed_px.copy()
+    observed[:, 3] = np.nan  # where drone 1 is now nobody else was
+    assert without_alike((2, 3, 1), restarted, ()) == (2, 3)
+    elsewhere = replace(restarted, observed_px=observed)
+    assert without_alike((2, 3, 1), elsewhere, ()) == (2, 3, 1)
+
+
 def test_who_is_needed_or_was_never_in_the_map_is_not_left_out(alike: LandmarkMap) -> None:
     assert without_alike((1, 2, 3), alike, (3,)) == (1, 2, 3)
     assert without_alike((1, 2, 4, 5, 3), alike, ()) == (1, 2, 4, 5)

@@ -279,7 +279,8 @@ def test_an_older_map_that_still_comes_in_is_kept() -> None:
     assert events == [BlobReceived(1, BlobKind.MAP, BLOB)]
 
 
-def test_who_asks_all_the_time_gets_a_quarter_of_what_may_be_said() -> None:
+@pytest.mark.parametrize("n_tags", [50, 10_000])
+def test_who_asks_all_the_time_gets_a_quarter_of_what_may_be_said(n_tags: int) -> None:
     options = TransferOptions(profile="radio-57k")
     transfers = transfers_with(options)
     n_bytes, ends_s = {1: 0, 2: 0}, 100.0
@@ -289,7 +290,7 @@ def test_who_asks_all_the_time_gets_a_quarter_of_what_may_be_said() -> None:
         transfers.receive(1, Chunk(whole.tag, index, 0, whole.cut(BLOB, index)), 0.0)
     for step in range(10_000):
         now_s = step * ends_s / 10_000
-        transfers.receive(1, full_chunk(step % 50, 3, ask=1), now_s)
+        transfers.receive(1, full_chunk(step % n_tags, 3, ask=1), now_s)
         transfers.receive(1, Chunk(whole.tag, 0, 1, whole.cut(BLOB, 0)), now_s)
         if step % 100 == 0:
             transfers.receive(2, full_chunk(7, step // 100, ask=1), now_s)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from tests.swarm.sky import Sky
 from vcl_companion.errors import ConfigError
-from vcl_companion.swarm.epochs import FIRST, VACANT, Epochs, taken_by
+from vcl_companion.swarm.epochs import FIRST, VACANT, Epochs, is_before, taken_by
 from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.wire.messages import MAX_EPOCH, MapState
 
@@ -49,8 +49,30 @@ def test_at_the_end_of_all_epochs_nobody_is_fenced_for_ever() -> None:
     group.map_state(1, state(), 0.0)
     group.map_state(3, state(epoch=MAX_EPOCH), 4.0)
     group.poll(5.0)
-    assert (group.coordinator, group.epoch) == (2, MAX_EPOCH)
+    # The first one comes again, and is above the last.
+    assert (group.coordinator, group.epoch) == (2, 0x102)
     assert group.may_lead(2)
+    group.map_state(1, state(), 6.0)
+    assert group.coordinator == 1
+    assert group.is_fenced(1)
+    assert not group.may_lead(1)
+
+
+@given(known=st.integers(0, MAX_EPOCH), told=st.integers(0, MAX_EPOCH), own=st.integers(1, 250))
+@example(known=0x105, told=MAX_EPOCH, own=2)
+@example(known=0x105, told=0x105 + (1 << 31) - 1, own=2)
+def test_whatever_a_wrong_peer_tells_there_is_a_next_epoch(known: int, told: int, own: int) -> None:
+    epochs, other = Epochs(own), Epochs(251 - own)
+    for team, epoch in ((0, known), (7, told), (0, told)):
+        epochs.hear(team, epoch)
+    before = epochs.of(0)
+    taken = epochs.take(0)
+    assert is_before(before, taken)
+    assert not is_before(taken, before)
+    assert taken_by(taken) == own
+    other.hear(0, before)
+    other.hear(0, taken)
+    assert other.of(0) == taken
 
 
 def test_while_nobody_was_lost_there_is_one_team_under_the_first_epoch() -> None:

@@ -142,6 +142,22 @@ def test_a_receiver_that_restarts_midway_still_gets_it() -> None:
     assert network.n_bytes < 2.0 * len(BLOB)
 
 
+def test_a_receiver_that_restarts_when_it_lacks_the_last_chunk_begins_again() -> None:
+    # Drawn so that all but the last chunk arrive, and that is known, before it does.
+    network = two_drones(Weather(loss=0.3), seed=17)
+    network.drones[1].submit(2, MAP, BLOB, network.now_s)
+    (sending,) = network.drones[1]._sendings
+    arrived = sending._receivers[2].arrived
+    network.run(400.0, stop=lambda: bool(arrived[:-1].all()))
+    assert not arrived[-1]
+    network.add(2)
+    restarted_s = network.now_s
+    network.run(400.0, stop=lambda: bool(network.ends()))
+    assert network.ends() == [BlobDelivered(2, 1)]
+    assert network.blobs(2) == [BLOB]
+    assert network.now_s - restarted_s < 10.0
+
+
 def test_a_sender_that_restarts_midway_sends_little_twice() -> None:
     network = two_drones(options=TransferOptions(rate_bytes_per_s=50_000.0))
     network.drones[1].submit(2, MAP, BLOB, network.now_s)

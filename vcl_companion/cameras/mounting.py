@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from vcl_companion.cameras.source import CameraOptions
+from vcl_companion.errors import RecordingError
 from vcl_companion.geometry.rotation import Array, euler_from_matrix, matrix_from_euler
 from vcl_companion.recording.sensor import BODY_FROM_CAM_FORWARD, Sensor, check_lens, read_sensor
+from vcl_companion.wire.pose_codec import check_camera
 
 _SIDES = (("forward", "back"), ("right", "left"), ("down", "up"))
 
@@ -35,7 +37,8 @@ def read_calibration(options: CameraOptions) -> Sensor:
     """Read the calibration file; what the options say of the mounting wins over its ``T_BS``.
 
     Raises:
-        RecordingError: it cannot be used, or nobody says how the camera sits.
+        RecordingError: it cannot be used, its images are larger than maps take, or nobody says
+            how the camera sits.
     """
     mounting, position_m = options.mounting_deg, options.position_m
     path = Path(options.calibration)
@@ -45,6 +48,10 @@ def read_calibration(options: CameraOptions) -> Sensor:
         position_m=None if position_m is None else np.array(position_m),
     )
     check_lens(path, sensor.camera)
+    try:
+        check_camera(sensor.camera)
+    except ValueError as error:
+        raise RecordingError(f"{path}: no map takes its images: {error}") from error
     return sensor
 
 

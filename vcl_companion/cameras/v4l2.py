@@ -28,6 +28,9 @@ from vcl_companion.errors import DeviceError
 _log = logging.getLogger(__name__)
 
 _STALLED_AFTER_S = 2
+_MAX_FAILURES = 5
+# A device that is gone says so at once, each time that it is asked.
+_PAUSE_S = 0.02
 _OLDEST_STAMP_NS = 2_000_000_000
 # Drivers that convert the device's clock into the host's may overshoot a little.
 _NEWEST_STAMP_NS = -10_000_000
@@ -59,18 +62,25 @@ class V4l2Camera:
         size_px: tuple[int, int],
         time_offset_s: float,
         clock: Clock,
+        patience_s: float = _STALLED_AFTER_S,
     ) -> None:
         """Keep how to open the device; nothing is opened before ``frames``.
 
         Args:
             name: the device, for messages.
-            open_capture: opens it, in the reader's thread; may raise DeviceError.
+            open_capture: opens it, in the reader's thread, and again whenever it stops; may
+                raise DeviceError.
             size_px: the (width, height) that frames must have.
             time_offset_s: device timestamp to mid-exposure, s.
             clock: CLOCK_MONOTONIC.
+            patience_s: it is opened again when no frame has come for so long, s, after a quarter
+                of that, then after twice as long each time, five times in a row at most.
         """
         self._name, self._open_capture, self._size_px = name, open_capture, size_px
         self._offset_ns, self._clock = round(time_offset_s * 1e9), clock
+        self._patience_s = patience_s
+        # Of the reader's thread, however often the device is opened.
+        self._sequence, self._last_ns, self._is_stamped = -1, -1, True
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._arrived = asyncio.Event()
@@ -113,46 +123,89 @@ class V4l2Camera:
         """Read until told to stop; everything here runs in the reader's thread."""
         failure: DeviceError | None = None
         try:
-            capture = self._open_capture()
-            try:
-                self._read_frames(capture, loop)
-            finally:
-                capture.release()
+            self._read_on(loop)
         except DeviceError as error:
             failure = error
         except cv2.error as error:
-            failure = DeviceError(f"camera {self._name}: {str(error).strip().splitlines()[0]}")
+            failure = DeviceError(f"camera {self._name}: {_in_one_line(error)}")
         with suppress(RuntimeError):  # the loop may be gone when the process ends
             loop.call_soon_threadsafe(self._offer, None, failure)
 
-    def _read_frames(self, capture: Capture, loop: asyncio.AbstractEventLoop) -> None:
-        sequence, last_ns, trusted = -1, -1, True
+    def _read_on(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Read, and open the device anew when it stops: a loose plug must not end the flight.
+
+        Raises:
+            DeviceError: it never gave a frame, or gives none however often it is opened.
+        """
+        failures = 0
         while not self._stop.is_set():
-            complete, image = capture.read()
+            before, why = self._sequence, "stopped sending frames"
+            try:
+                capture = self._open_capture()
+                try:
+                    self._read_frames(capture, loop)
+                finally:
+                    capture.release()
+            except _WrongSizeError:
+                raise
+            except DeviceError as error:
+                if self._sequence < 0:
+                    raise
+                why = str(error).removeprefix(f"camera {self._name}: ")
+            failures = 1 if self._sequence > before else failures + 1
+            if self._stop.is_set():
+                return
+            if self._sequence < 0 or failures >= _MAX_FAILURES:
+                raise DeviceError(f"camera {self._name}: {why}")
+            _log.warning("camera %s: %s; opening it again", self._name, why)
+            self._stop.wait(self._patience_s * 2.0 ** (failures - 3))
+
+    def _read_frames(self, capture: Capture, loop: asyncio.AbstractEventLoop) -> None:
+        """Read until told to stop, or until nothing has come for too long."""
+        came_at_ns = self._clock.now_ns()
+        while not self._stop.is_set():
+            try:
+                complete, image = capture.read()
+            except cv2.error as error:
+                _log.debug("camera %s: %s", self._name, _in_one_line(error))
+                complete = False
             received_at_ns = self._clock.now_ns()
             if not complete:
-                raise DeviceError(f"camera {self._name}: stopped sending frames")
-            sequence += 1
+                # An image that cannot be decoded comes as none, and the next may be whole.
+                if received_at_ns - came_at_ns >= self._patience_s * 1e9:
+                    return
+                self._stop.wait(_PAUSE_S)
+                continue
+            came_at_ns = received_at_ns
+            self._sequence += 1
             if image.ndim == 3:
                 image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
             if image.shape[::-1] != self._size_px:
-                raise DeviceError(
+                raise _WrongSizeError(
                     f"camera {self._name}: gives {image.shape[1]}x{image.shape[0]}, "
                     f"the calibration says {self._size_px[0]}x{self._size_px[1]}"
                 )
             stamp_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
             if not _NEWEST_STAMP_NS <= received_at_ns - stamp_ns <= _OLDEST_STAMP_NS:
-                if trusted:
+                if self._is_stamped:
                     _log.warning("camera %s: no usable timestamps, using arrival", self._name)
-                trusted, stamp_ns = False, received_at_ns
+                self._is_stamped, stamp_ns = False, received_at_ns
             captured_at_ns = stamp_ns + self._offset_ns
-            if captured_at_ns <= last_ns:
+            if captured_at_ns <= self._last_ns:
                 continue  # the same frame again, or a step back: never an older instant
-            last_ns = captured_at_ns
+            self._last_ns = captured_at_ns
             pixels = np.asarray(image, dtype=np.uint8)
-            frame = Frame(pixels, captured_at_ns, sequence, received_at_ns)
+            frame = Frame(pixels, captured_at_ns, self._sequence, received_at_ns)
             with suppress(RuntimeError):
                 loop.call_soon_threadsafe(self._offer, frame, None)
+
+
+class _WrongSizeError(DeviceError):
+    """No opening it again helps."""
+
+
+def _in_one_line(error: cv2.error) -> str:
+    return str(error).strip().splitlines()[0]
 
 
 def open_capture(

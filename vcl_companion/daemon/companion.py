@@ -265,8 +265,11 @@ class Companion:
             self._outcomes.close(frame, None if state is None else "fused")
         elif state is None:
             again = await self._given_up(frame, asked.stored(), refused)
-        elif not await self._is_placed_by_patches(frame):
-            # Led by what peers said, the frame's own patches would have told it more closely.
+        elif await self._is_placed_by_patches(frame):
+            pass  # led by what peers said, the frame's own patches tell it more closely
+        elif self._maps.has_left_world(asked.world):
+            self._give_up(frame, NotLocalized("peers told a place in a world that was left since"))
+        else:
             unsent = self._send(frame, state, "inter", "peer")
             if unsent is None:
                 self._outcomes.close(frame)

@@ -134,7 +134,8 @@ class Forked:
     def _read(self) -> None:
         if self._realtime:
             run_before_others()
-        with contextlib.suppress(OSError, EOFError):
+        # Whatever it is, too little memory say, nothing that comes after it can be read.
+        with contextlib.suppress(Exception):
             while True:
                 self._answer(*_receive(self._socket))
         with self._lock:

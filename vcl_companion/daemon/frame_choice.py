@@ -64,7 +64,8 @@ class FrameChoice:
         until_ns = nearest.captured_at_ns
         await self._estimator.settled(until_ns, self._clock.now_ns())
         stored = self._maps.current
-        since_ns = max(until_ns - FURTHEST_BACK_NS, self._shown_until_ns(stored.index.landmark_map))
+        shown_ns = self._shown_until_ns(stored.index.landmark_map, until_ns)
+        since_ns = max(until_ns - FURTHEST_BACK_NS, shown_ns)
         fixed: Frame | None = None
         for frame in reversed(self._frames.after(since_ns)):
             fix = self._estimator.fix_at(frame.captured_at_ns)
@@ -75,7 +76,15 @@ class FrameChoice:
             fixed = fixed or frame
         return fixed or nearest
 
-    def _shown_until_ns(self, landmark_map: LandmarkMap) -> int:
-        """Return when our newest keyframe of a map was taken, and a moment; -1 without one."""
-        ours = [k.captured_at_ns for k in landmark_map.keyframes if k.drone_id == self._system_id]
+    def _shown_until_ns(self, landmark_map: LandmarkMap, before_ns: int) -> int:
+        """Return when our newest keyframe before an instant was taken, and a moment; -1 for none.
+
+        What a map has of us from before this computer was started has a later instant than any
+        of now: its clock began anew.
+        """
+        ours = [
+            k.captured_at_ns
+            for k in landmark_map.keyframes
+            if k.drone_id == self._system_id and k.captured_at_ns <= before_ns
+        ]
         return max(ours) + _LATER_NS if ours else -1

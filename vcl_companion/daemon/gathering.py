@@ -95,7 +95,8 @@ class Gathering:
         if self._peers is None or frame.drone_id != peer or peer not in self._peers:
             return "frame nobody asked for"
         sent = self._peers[peer]
-        if frame.request_id != self._id_of(len(sent.frames)):
+        is_asked = sent.asked_at_s != float("-inf")  # the numbers of more can be guessed
+        if not is_asked or frame.request_id != self._id_of(len(sent.frames)):
             return "frame nobody asked for"
         if self._is_of_another_instant(peer, frame, len(sent.frames)):
             return "frame of another instant than the one asked for"

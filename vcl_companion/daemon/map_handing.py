@@ -142,12 +142,20 @@ class MapHanding:
                 continue
             if self._group.state_of(peer) is None:
                 continue  # it is about to say what it has, perhaps a map of a world of its own
-            if not self._group.has_map(peer) and self._parts.comes_first(peer, stored):
+            is_on_part = self._is_on_part(peer)
+            if not self._group.has_map(peer) and self._parts.comes_first(
+                peer, stored, is_on_part=is_on_part
+            ):
                 continue
             self._hand(peer, stored, now_s, self._form_for)
         merges = self._branches.receiver(now_s)
         for peer in (*self._branches.joining(), *(() if merges is None else (merges,))):
             self._hand(peer, stored, now_s, _whole)
+
+    def _is_on_part(self, peer: int) -> bool:
+        """Whether a peer without a map flies on a part of one."""
+        state = self._group.state_of(peer)
+        return state is not None and state.n_landmarks > 0 and not self._group.has_map(peer)
 
     def _abandon_all_but(self, revision: bytes) -> None:
         """Stop sending maps that a newer one has replaced, to who is away at the moment as well.
@@ -184,8 +192,7 @@ class MapHanding:
         None while an image of the map is still on its way there, or it is still being made.
         """
         if n_delivered == 0 and not self._group.has_map(peer):
-            state = self._group.state_of(peer)
-            is_on_part = state is not None and state.n_landmarks > 0
+            is_on_part = self._is_on_part(peer)
             rest = self._parts.rest_for(peer, stored, self._now_s(), is_on_part=is_on_part)
             if rest is None:
                 return None

@@ -69,9 +69,14 @@ class MapParts:
         """Whether a map has parts; a first one is a frame of each drone: less of it is none."""
         return bool(stored.parent) and len(stored.data) > self._quick_bytes
 
-    def comes_first(self, peer: int, stored: HandOut) -> bool:
-        """Send a peer without a map a part of ours; whether that has to arrive before the rest."""
+    def comes_first(self, peer: int, stored: HandOut, *, is_on_part: bool) -> bool:
+        """Send a peer without a map a part of ours; whether that has to arrive before the rest.
+
+        Who is on a part of somebody else's takes none of ours, and knows nothing of its rest.
+        """
         sent = self._sent.get(peer)
+        if sent is None and is_on_part:
+            return False
         if sent is not None:
             if not sent.has_arrived:
                 # Goes on, or begins again when it was given up.

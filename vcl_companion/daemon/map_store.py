@@ -6,6 +6,7 @@ import asyncio
 import errno
 import logging
 import os
+import re
 import tempfile
 from collections import deque
 from contextlib import suppress
@@ -15,11 +16,13 @@ from pathlib import Path
 from vcl_companion.errors import ConfigError
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.mapping.templates import Templates
-from vcl_companion.wire.map_codec import revision_of
+from vcl_companion.wire.map_codec import REVISION_BYTES, revision_of
 
 _log = logging.getLogger(__name__)
 
 _MAX_LEFT = 256  # revisions remembered by name
+_KEPT_BYTES = 256 << 20  # a thousand of a quarter of a megabyte, as small maps are
+_REVISION = re.compile(f"[0-9a-f]{{{2 * REVISION_BYTES}}}")
 SAVED_FILE = "saved.vclmap"
 # Several times the longest of maps; a file that is longer is something else.
 _MAX_FILE_BYTES = 64 << 20
@@ -78,14 +81,16 @@ class MapStore:
     were left are known by name.
 
     Args:
-        directory: where every revision is kept as ``<revision>.vclmap``, and the one to begin
-            with as ``saved.vclmap``; empty for nowhere.
+        directory: where revisions are kept as ``<revision>.vclmap``, and the one to begin with as
+            ``saved.vclmap``; empty for nowhere.
+        kept_bytes: of revisions of all flights together, the newest.
 
     Raises:
         ConfigError: the directory cannot be made, or no file in it.
     """
 
-    def __init__(self, directory: str) -> None:
+    def __init__(self, directory: str, kept_bytes: int = _KEPT_BYTES) -> None:
+        self._kept_bytes = kept_bytes
         self.current: StoredMap | None = None
         self.is_improved = False
         """Whether the one in use has had a better index made of it since it came."""
@@ -179,13 +184,14 @@ class MapStore:
 
         Written beside and renamed when it is on the disk, so that a power cut
         leaves no half map. A disk that is full must not end the flight: the
-        failure is logged.
+        failure is logged. Nor must maps fill it: the oldest have to go.
         """
         if self._directory is None:
             return
         path = self._directory / f"{stored.revision.hex()}.vclmap"
         try:
             _write_whole(path, stored.data)
+            _remove_oldest(self._directory, self._kept_bytes)
         except OSError as error:
             _log.error("the map %s cannot be kept: %s", path, error.strerror)
 
@@ -225,6 +231,23 @@ class MapStore:
         """
         if self.saved_file is not None:
             self.saved_file.unlink(missing_ok=True)
+
+
+def _remove_oldest(directory: Path, kept_bytes: int) -> None:
+    """Remove what is beyond so many bytes of revisions, but never the newest one.
+
+    Raises:
+        OSError: that has failed.
+    """
+    # By revision: the saved one, and whatever else is there, is not ours to remove.
+    files = [file for file in directory.glob("*.vclmap") if _REVISION.fullmatch(file.stem)]
+    found = [(file.stat(), file) for file in files]
+    newest_first = sorted(found, key=lambda one: one[0].st_mtime_ns, reverse=True)
+    n_bytes = 0
+    for status, file in newest_first:
+        n_bytes += status.st_size
+        if n_bytes > kept_bytes and file != newest_first[0][1]:
+            file.unlink(missing_ok=True)
 
 
 def _write_whole(path: Path, data: bytes) -> None:

@@ -109,13 +109,14 @@ class OwnFixes:
             may_doubt = now_s >= self._doubted_at_s + _DOUBT_EVERY_S
             effort = Effort(may_search=stored.templates is None, may_doubt=may_doubt)
             fix = await self._localized(frame, stored, ned_from_body, effort)
+            look = Look(stored, ned_from_body, fix, now_s)
             if not self._maps.has_left_world(stored.world):
-                break
+                if isinstance(fix, Localized) and is_doubtful(fix):
+                    self._doubted_at_s = now_s
+                look = await self._by_odometry(frame, look) or look
+            if not self._maps.has_left_world(stored.world):  # nor while that was looked at
+                return look
             stored = self._maps.current or stored
-        if isinstance(fix, Localized) and is_doubtful(fix):
-            self._doubted_at_s = now_s
-        look = Look(stored, ned_from_body, fix, now_s)
-        return await self._by_odometry(frame, look) or look
 
     async def _by_odometry(self, frame: Frame, on_map: Look) -> Look | None:
         """Look at a frame by our own last frames, if these may tell more; None if they do not."""
@@ -145,8 +146,6 @@ class OwnFixes:
             if isinstance(own, Localized):
                 break
         if isinstance(own, NotLocalized) or not self._odometry.tells_more(own, on_map.fix):
-            return None
-        if self._maps.has_left_world(on_map.stored.world):
             return None
         return replace(on_map, fix=own, local=local)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import replace
 
 from vcl_companion.daemon.map_branches import MapBranches, way_into
@@ -45,6 +46,8 @@ class OwnMaps:
         self._branches = branches
         self._handing = handing
         self._use = use
+        # One goes to peers ahead at a time, and nobody is given what is late already.
+        self._adopting = asyncio.Lock()
 
     async def adopt(self, built: LandmarkMap, instead_of: StoredMap | None) -> NoMap | None:
         """Fly on a map that was made here, exactly as peers will decode it, and hand it out.
@@ -56,6 +59,12 @@ class OwnMaps:
         Returns:
             None, or why it cannot be used. A map that came meanwhile stays.
         """
+        async with self._adopting:
+            if not self._maps.is_in_use(instead_of):
+                return None
+            return await self._adopt(built, instead_of)
+
+    async def _adopt(self, built: LandmarkMap, instead_of: StoredMap | None) -> NoMap | None:
         ahead = await made_or_no_map(
             self._work.encoded(built, instead_of), "a map cannot be encoded", "encoding it failed"
         )

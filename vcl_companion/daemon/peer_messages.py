@@ -87,6 +87,9 @@ class PeerMessages:
                 # Most say what was said before, and in a large swarm that would be all the work.
                 return self._presence.map_state(peer, message)
             case FrameRequest():
+                if not self._group.may_lead(peer):
+                    self._refusals.count(peer, "a frame asked for by who does not coordinate")
+                    return False
                 self._answers.want(peer, message)
             case MapRefused():
                 if peer == self._group.coordinator:

@@ -107,6 +107,7 @@ class Resets:
         if expected is not None and _explains(pose, covariance, expected):
             if not is_first:
                 self._say("a jump within the pose's own error: nothing is made of it", False)
+            self._shift = None  # where a slide has come to, it is
             self._go_on(n_jumps)
             return ""
         away = "" if expected is None else f" {_metres(pose, expected):.1f} m away"

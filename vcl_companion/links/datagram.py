@@ -20,8 +20,8 @@ from vcl_companion.links.reconnect import (
 )
 
 _MAX_DATAGRAM_BYTES = 65535
-# A flood must not keep the event loop from everything else.
-_MAX_BURST = 64
+# A flood must not keep the event loop from everything else, whatever its datagrams hold.
+_MAX_BURST, _MAX_BURST_BYTES = 64, 65536
 
 
 class DatagramTransport(Reconnecting):
@@ -65,7 +65,9 @@ class DatagramTransport(Reconnecting):
                 self._socket = None
 
     def _receive_burst(self, opened: socket.socket, on_bytes: OnBytes) -> None:
-        for _ in range(_MAX_BURST):
+        n_bytes = n_received = 0
+        while n_received < _MAX_BURST and n_bytes < _MAX_BURST_BYTES:
+            n_received += 1
             try:
                 data, sender = opened.recvfrom(_MAX_DATAGRAM_BYTES)
             except BlockingIOError:
@@ -75,6 +77,7 @@ class DatagramTransport(Reconnecting):
                 continue
             except OSError as error:
                 raise LinkLostError(f"receive failed: {error.strerror}") from error
+            n_bytes += len(data)
             address = _bare(sender)
             if not self._accepts(address):
                 self._tally.refuse("sender's address not accepted")

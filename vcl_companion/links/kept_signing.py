@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
+import os
 from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
@@ -23,12 +25,14 @@ _RENEWED_TICKS = 5 * TICKS_PER_S
 # Who ends may still say something; who is started again at once must not be far ahead.
 _END_TICKS = TICKS_PER_S
 _LOOK_S = 0.5
+_DISK_IS_FULL = os.strerror(errno.ENOSPC)
 
 
 class KeptSigning:
     """One link's signing, and the file that is ahead of all that it signs.
 
-    A disk that is full must not end the flight: that is logged, and signing goes on.
+    A disk that is full must not end the flight, nor keep a restart from going on with it: that
+    is logged, and signing goes on.
 
     Args:
         key_file: the key; empty: nothing is signed.
@@ -41,7 +45,7 @@ class KeptSigning:
         now: tells the time.
 
     Raises:
-        ConfigError: the key cannot be used, or the file cannot be written.
+        ConfigError: the key cannot be used, or the file cannot be written where there is room.
     """
 
     def __init__(
@@ -66,7 +70,10 @@ class KeptSigning:
                 left = self._file.read()
         self.signing = Signing(key, SwarmTime(left.reserved, now()), left.streams, options)
         self._reserved = left.reserved
-        if self._file is not None and (why := self._file.write(self._ahead())):
+        why = "" if self._file is None else self._file.write(self._ahead())
+        if why == _DISK_IS_FULL:  # a restart in the air is part of the flight
+            _log.error("%s: timestamps of signed frames cannot be kept: %s", timestamp_file, why)
+        elif why:
             raise ConfigError(
                 f"{timestamp_file}: timestamps of signed frames cannot be kept there ({why})"
             )

@@ -55,6 +55,8 @@ from vcl_companion.links.signing import (
 _MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
 _OVERHEAD_1, _OVERHEAD_2 = 8, 12
 _CHECKSUM_BYTES = 2
+# Of a datagram, where a magic number was none. One frame that was damaged on its way has two.
+_MOST_TRIED_AGAIN = 32
 
 # PARAM_SET, its value as bytes: an integer's may be a float that is not a number
 # | 0  | 4s  | value            |
@@ -100,25 +102,30 @@ class Codec:
 
     def decode_stream(self, data: bytes) -> list[Message]:
         """Return the messages that ``data`` completes, after what came before it."""
-        messages, self._rest = self._decode(self._rest + data)
+        data = self._rest + data
+        messages, self._rest = self._decode(data, len(data))
         return messages
 
     def decode_datagram(self, data: bytes) -> list[Message]:
         """Return the messages in one datagram, whatever came before it."""
-        messages, rest = self._decode(data)
+        messages, rest = self._decode(data, _MOST_TRIED_AGAIN)
         if rest:
             self._tally.refuse("truncated")
         return messages
 
-    def _decode(self, data: bytes) -> tuple[list[Message], bytes]:
+    def _decode(self, data: bytes, most_tried_again: int) -> tuple[list[Message], bytes]:
         """Return messages and the unfinished frame at the end.
 
         After a wrong checksum the search goes on at the next byte, so that a
-        magic number within garbage cannot swallow true messages.
+        magic number within garbage cannot swallow true messages; but not for ever, for
+        each place costs a checksum before anybody's signature is looked at.
         """
         messages: list[Message] = []
-        at = 0
+        at = n_tried_again = 0
         while at < len(data):
+            if n_tried_again > most_tried_again:
+                self._tally.refuse("garbage bytes", len(data) - at)
+                break
             magic = data[at]
             if magic not in (_MAGIC_1, _MAGIC_2):
                 next_at = _next_magic(data, at)
@@ -131,6 +138,7 @@ class Codec:
             if flags & ~SIGNED_FLAG:
                 self._tally.refuse("unknown incompatibility flags")
                 at += 1
+                n_tried_again += 1
                 continue
             overhead = _OVERHEAD_2 if magic == _MAGIC_2 else _OVERHEAD_1
             end = at + overhead + data[at + 1] + (TRAILER_BYTES if flags else 0)
@@ -140,6 +148,7 @@ class Codec:
             if message is not None:
                 messages.append(message)
             at = end if consumed else at + 1
+            n_tried_again += not consumed
         return messages, b""
 
     def _frame(self, frame: bytes, following: bytes) -> tuple[Message | None, bool]:

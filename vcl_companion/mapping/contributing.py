@@ -26,11 +26,8 @@ def without_alike(
             sees now is not known.
     """
     seen = landmark_map.seen
-    newest: dict[int, int] = {}
-    for column, k in enumerate(landmark_map.keyframes):
-        before = newest.get(k.drone_id)
-        if before is None or k.captured_at_ns > landmark_map.keyframes[before].captured_at_ns:
-            newest[k.drone_id] = column
+    # By their order, which is that of growth: a drone's clock begins anew when it is restarted.
+    newest = {k.drone_id: column for column, k in enumerate(landmark_map.keyframes)}
     chosen: list[int] = []
     for drone in drones:
         if drone in needed or drone not in newest:

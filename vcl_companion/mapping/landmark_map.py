@@ -19,6 +19,8 @@ from vcl_companion.vision.information import is_covariance
 
 # A revision, and with it a world, is named by so many bytes.
 NAME_BYTES = 8
+# What tells that there is none where there are always so many.
+NO_NAME = bytes(NAME_BYTES)
 # Of the maps that were merged into one the newest are remembered.
 MAX_JOINED = 16
 
@@ -70,8 +72,8 @@ class JoinedMap:
 
     def __post_init__(self) -> None:
         for name in ("revision", "world"):
-            if len(getattr(self, name)) != NAME_BYTES:
-                raise ValueError(f"JoinedMap.{name} must have {NAME_BYTES} bytes")
+            if len(getattr(self, name)) != NAME_BYTES or getattr(self, name) == NO_NAME:
+                raise ValueError(f"JoinedMap.{name} must have {NAME_BYTES} bytes, not all 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +131,8 @@ class LandmarkMap:
         for distance in self.distances:
             if not (0 <= distance.keyframe_a < v and 0 <= distance.keyframe_b < v):
                 raise ValueError(f"LandmarkMap: a known distance names no keyframe: {distance}")
-        if len(self.world) not in (0, NAME_BYTES) or (self.world and not self.parent):
+        is_name = len(self.world) in (0, NAME_BYTES) and self.world != NO_NAME
+        if not is_name or (self.world and not self.parent):
             raise ValueError(f"LandmarkMap.world is none of a map of parent {self.parent!r}")
         if len(self.joined) > MAX_JOINED or (self.joined and not self.world):
             raise ValueError(

@@ -5,9 +5,15 @@ has taken it. So two drones that know nothing of each other, in two parts of a s
 take the same one, and of two any is the higher for everybody. Who begins to coordinate takes
 the next above all that it knows of its team; everybody tells the highest it knows, so that a
 drone that was restarted, and a coordinator that was away, hear it with the next state.
+
+After the last number comes the first one again, and of two the higher one is that which is
+reached from the other by less than half of them (serial numbers, RFC 1982): whatever a wrong
+peer tells, there is a next one.
 """
 
 from __future__ import annotations
+
+from functools import reduce
 
 from vcl_companion.wire.messages import MAX_EPOCH
 
@@ -18,6 +24,7 @@ VACANT = 1
 """The leader was there and was lost; nobody has taken its place yet."""
 
 _STEP = 1 << 8
+_N_EPOCHS = MAX_EPOCH + 1
 
 
 def taken_by(epoch: int) -> int:
@@ -25,10 +32,21 @@ def taken_by(epoch: int) -> int:
     return epoch % _STEP
 
 
+def is_before(epoch: int, other: int) -> bool:
+    """Whether an epoch is lower than another; nothing that was taken is before who takes none."""
+    if min(epoch, other) <= VACANT:
+        return epoch < other
+    return 0 < (other - epoch) % _N_EPOCHS < _N_EPOCHS // 2
+
+
+def _higher(epoch: int, other: int) -> int:
+    return other if is_before(epoch, other) else epoch
+
+
 def _next_of(own_id: int, epoch: int) -> int:
-    """Return the lowest epoch of a drone above another; at the end of all numbers that one."""
-    above = (epoch // _STEP + 1) * _STEP + own_id
-    return above if above <= MAX_EPOCH else epoch
+    """Return the lowest epoch of a drone above another."""
+    count = (epoch // _STEP + 1) % (_N_EPOCHS // _STEP)
+    return max(count, 1) * _STEP + own_id
 
 
 class Epochs:
@@ -49,8 +67,7 @@ class Epochs:
 
     def hear(self, team: int, epoch: int) -> None:
         """Note what somebody knows."""
-        if epoch > self.of(team):
-            self._highest[team] = epoch
+        self._highest[team] = _higher(self.of(team), epoch)
 
     def is_ours(self, team: int) -> bool:
         """Whether this drone has taken the highest one, in this life of it.
@@ -61,6 +78,8 @@ class Epochs:
 
     def take(self, team: int) -> int:
         """Take the next one of a team, above those of all teams: names of teams come again."""
-        highest = max(self._highest.values(), default=FIRST)
-        self._taken[team] = self._highest[team] = _next_of(self._own_id, highest)
-        return self._taken[team]
+        taken = _next_of(self._own_id, reduce(_higher, self._highest.values(), FIRST))
+        if not is_before(self.of(team), taken):  # all teams' may be further apart than half
+            taken = _next_of(self._own_id, self.of(team))
+        self._taken[team] = self._highest[team] = taken
+        return taken

@@ -19,7 +19,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from vcl_companion.errors import ConfigError
-from vcl_companion.swarm.epochs import FIRST, VACANT, Epochs, taken_by
+from vcl_companion.swarm.epochs import FIRST, VACANT, Epochs, is_before, taken_by
 from vcl_companion.swarm.overlap import OverlapGraph, OverlapOptions, OwnSignature
 from vcl_companion.swarm.pace import stretch_of
 from vcl_companion.swarm.presence import Presence
@@ -217,7 +217,7 @@ class Group:
     def is_fenced(self, peer: int) -> bool:
         """Whether a peer of our team knows only of an older epoch: its word may be outdated."""
         state = self._states.get(peer)
-        return (state.epoch if state else FIRST) < self.epoch
+        return is_before(state.epoch if state else FIRST, self.epoch)
 
     def may_lead(self, peer: int) -> bool:
         """Whether to take maps of a peer, and do what it asks for, as our coordinator."""

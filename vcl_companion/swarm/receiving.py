@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
 from dataclasses import dataclass, replace
 
 from vcl_companion.errors import WireError
@@ -39,7 +40,7 @@ from vcl_companion.wire.tunnel import encode_payload
 _MAX_DAMAGED = 3  # whole blobs with a wrong hash before a transfer is refused
 _MAX_STATUSES = 8  # payloads in one answer
 _MAX_SETTLED = 1024  # remembered finished transfers, of all peers
-_MAX_ANSWERS = 256  # answers owed at one time, to all peers
+_MAX_ANSWERS = 64  # answers owed at one time, to one peer
 _QUIET_SHARE = 0.1  # of the status interval: no chunk for this long, and an answer goes out
 _IDLE_SHARE = 0.25  # of the give-up time: silent for this long, and memory may be taken
 # Of the budget, for answers to one peer: who asks all the time shall not have all of it.
@@ -105,6 +106,7 @@ class Receptions:
         self._incoming: dict[_Key, Incoming] = {}
         self._settled: dict[_Key, _Settled] = {}
         self._answers: dict[_Key, _Answer] = {}
+        self._n_owed: Counter[int] = Counter()  # of these, to each peer
         self._answer_budgets: dict[int, ByteBudget] = {}  # by peer
         self._newest: dict[tuple[int, BlobKind], int] = {}  # tag of what a peer began last
 
@@ -165,6 +167,7 @@ class Receptions:
             if not budget.allows_one():
                 continue
             answer = self._answers.pop(key)
+            self._n_owed[key[0]] -= 1
             for status in self._statuses(key, answer.ask):
                 budget.spend(len(encode_payload(status)[1]))
                 out.append((key[0], status))
@@ -377,8 +380,12 @@ class Receptions:
 
     def _owe(self, key: _Key, answer: _Answer) -> None:
         """Note an answer; beyond a bound it is left out, and the sender asks again."""
-        if key in self._answers or len(self._answers) < _MAX_ANSWERS:
-            self._answers[key] = answer
+        if key not in self._answers:
+            peer = key[0]
+            if self._n_owed[peer] >= _MAX_ANSWERS:
+                return
+            self._n_owed[peer] += 1
+        self._answers[key] = answer
 
     def _statuses(self, key: _Key, ask: int) -> list[TransferStatus]:
         """Return what there is to say about a transfer."""

@@ -335,17 +335,18 @@ class Sending:
         receiver.arrived[window] = ~missing | (receiver.arrived[window] & ~lost)
         receiver.answered(now_s)
         receiver.has(int(receiver.arrived.sum()), now_s)
+        waiting = self._waiting.copy()
+        # Without the first one it knows nothing of the rest, or not any more: it was restarted.
         if self._is_for_several:
             lacking = per_block(~receiver.arrived)
             self._aim(receiver, now_s, status.ask, slice(0, len(lacking)), lacking)
-            receiver.arrived[0] &= status.end > 0  # without it, it knows nothing of the rest
-            waiting = self._waiting.copy()
+            receiver.arrived[0] &= status.end > 0
             waiting[0] |= not receiver.arrived[0]
-            self._queue(waiting)
         else:
-            waiting = self._waiting.copy()
             waiting[window] |= lost
-            self._queue(waiting)
+            if status.end == 0 and self._sent_in[0] <= answered:
+                receiver.arrived[0], waiting[0] = False, True
+        self._queue(waiting)
         if not self._is_due():
             receiver.wait(now_s)
 

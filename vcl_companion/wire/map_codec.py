@@ -21,6 +21,7 @@ from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.mapping.landmark_map import (
     MAX_JOINED,
     NAME_BYTES,
+    NO_NAME,
     JoinedMap,
     Keyframe,
     KnownDistance,
@@ -293,9 +294,10 @@ def _take_anchor(reader: Reader) -> Array:
 
 def _checked_name(n_bytes: int, padded: bytes) -> bytes:
     """Return the parent revision, or the world's name, of its two fields."""
-    if n_bytes not in (0, NAME_BYTES) or padded[n_bytes:].strip(b"\0"):
+    name = padded[:n_bytes]
+    if n_bytes not in (0, NAME_BYTES) or padded[n_bytes:].strip(b"\0") or name == NO_NAME:
         raise WireError("map: malformed parent revision or world")
-    return padded[:n_bytes]
+    return name
 
 
 def _encode_joined(joined: JoinedMap) -> bytes:

@@ -109,7 +109,7 @@ def encode_camera(camera: Camera) -> bytes:
     Raises:
         ValueError: an image larger than peers accept, or absurd intrinsics.
     """
-    _check_camera(camera)
+    check_camera(camera)
     head = _CAMERA.pack(
         camera.width_px,
         camera.height_px,
@@ -131,7 +131,7 @@ def take_camera(reader: Reader) -> Camera:
     distortion = reader.unpack(struct.Struct(f"<{n_coefficients}d"))
     try:
         camera = Camera(width, height, fx, fy, cx, cy, _MODELS[model], distortion)
-        _check_camera(camera)
+        check_camera(camera)
     except ValueError as error:
         raise WireError(str(error)) from None
     return camera
@@ -156,7 +156,7 @@ def take_image(reader: Reader) -> bytes:
     return reader.take(n_bytes)
 
 
-def _check_camera(camera: Camera) -> None:
+def check_camera(camera: Camera) -> None:
     """Raise ValueError for intrinsics no lens has: they would overflow the arithmetic later."""
     side = max(camera.width_px, camera.height_px)
     if side > MAX_IMAGE_SIDE_PX:
