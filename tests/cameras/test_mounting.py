@@ -92,6 +92,16 @@ def test_a_file_without_a_matrix_needs_the_angles(tmp_path: Path) -> None:
     np.testing.assert_allclose(sits.translation, 0.0)
 
 
+def test_images_that_no_map_takes_are_refused_at_the_start(tmp_path: Path) -> None:
+    options = calibration(tmp_path, with_matrix=True)
+    large = Camera(2592, 1944, 2000.0, 2000.0, 1295.5, 971.5)
+    write_sensor(Path(options.calibration), Sensor(large, Pose.identity(), 20.0))
+    with pytest.raises(
+        RecordingError, match=r"camera\.yaml: no map takes .* 2592x1944 px, at most"
+    ):
+        read_calibration(options)
+
+
 @pytest.mark.parametrize("name", ["mounting_deg", "position_m"])
 @pytest.mark.parametrize("value", [(0.0, 400.0, 0.0), (0.0, 0.0, float("nan"))])
 def test_what_is_no_mounting_is_refused(name: str, value: tuple[float, ...]) -> None:
