@@ -1,5 +1,10 @@
 """The exceptions that leave a module on purpose; everything else is a bug."""
 
+import errno
+
+DISK_IS_FULL = frozenset((errno.ENOSPC, errno.EDQUOT))
+"""Of an OSError: what was to be kept cannot be, and a restart in the air goes on without."""
+
 
 class VclError(Exception):
     """A failure whose message is one line for a person: what, where, what to do."""

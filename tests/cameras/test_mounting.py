@@ -96,9 +96,7 @@ def test_images_that_no_map_takes_are_refused_at_the_start(tmp_path: Path) -> No
     options = calibration(tmp_path, with_matrix=True)
     large = Camera(2592, 1944, 2000.0, 2000.0, 1295.5, 971.5)
     write_sensor(Path(options.calibration), Sensor(large, Pose.identity(), 20.0))
-    with pytest.raises(
-        RecordingError, match=r"camera\.yaml: no map takes .* 2592x1944 px, "
-    ):
+    with pytest.raises(RecordingError, match=r"camera\.yaml: no map takes .* 2592x1944 px, "):
         read_calibration(options)
 
 

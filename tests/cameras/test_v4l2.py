@@ -164,7 +164,7 @@ def test_a_device_that_is_gone_for_good_ends_the_frames() -> None:
 
     with pytest.raises(DeviceError, match=r"^camera film: stopped sending frames$"):
         asyncio.run(levels_of(camera_of(open_next), 2))
-    assert n_opened == 5
+    assert 3 <= n_opened <= 6  # 25, 50, 100, 200 ms apart, within 600
 
 
 def test_a_device_that_never_gives_a_frame_is_opened_once() -> None:

@@ -294,7 +294,7 @@ def test_a_flood_of_requests_piles_nothing_up(tmp_path: Path) -> None:
     run(scenario())
 
 
-def test_who_does_not_coordinate_is_given_no_frame(tmp_path: Path) -> None:
+def test_who_does_not_coordinate_is_given_a_frame_now_and_then(tmp_path: Path) -> None:
     async def scenario() -> None:
         async with swarm(1, 2, 3, path=tmp_path) as members:
             two = await members.start(2)
@@ -303,11 +303,17 @@ def test_who_does_not_coordinate_is_given_no_frame(tmp_path: Path) -> None:
             await three.meets(2)
             await two.see(demo.frame(2))
             three.say(FrameRequest(7, 0, 0.0), 2)
-            kind = "a frame asked for by who does not coordinate"
+            assert (await three.answer())[1].request_id == 7
+            three.say(FrameRequest(8, 0, 0.0), 2)
+            kind = "frames asked for too often for no coordinator"
             await until(counted(two, kind, 1))
-            one.say(FrameRequest(6, 0, 0.0), 2)
-            assert (await one.answer())[1].request_id == 6
-            assert three.blobs.empty()
+            for number in (5, 6):
+                one.say(FrameRequest(number, 0, 0.0), 2)
+                assert (await one.answer())[1].request_id == number
+            hurry(11.0)
+            three.forget()
+            three.say(FrameRequest(9, 0, 0.0), 2)
+            assert (await three.answer())[1].request_id == 9
 
     run(scenario())
 

@@ -36,6 +36,12 @@ def fill(log: FlightLog) -> None:
     log.missed(2)
 
 
+def fly(path: Path) -> None:
+    log = FlightLog(str(path), ManualClock())
+    fill(log)
+    log.close(**SUMMARY)
+
+
 def lines(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
 
@@ -126,30 +132,48 @@ def test_earlier_flights_are_kept_beside_it(tmp_path: Path) -> None:
     for n in range(23):
         log = FlightLog(str(path), ManualClock())
         log.event("flight", str(n))
+        log.frame(0, 100, "dropped")
         log.close(**SUMMARY)
     kept = {file.name: lines(file)[0]["reason"] for file in tmp_path.iterdir()}
     earlier = {f"flight.jsonl.{back}": str(22 - back) for back in range(1, 21)}
     assert kept == {"flight.jsonl": "22", **earlier}
 
 
-def test_one_that_says_nothing_is_not_kept(tmp_path: Path) -> None:
+def test_starts_that_come_to_nothing_shift_no_flight_out(tmp_path: Path) -> None:
     path = tmp_path / "flight.jsonl"
-    path.touch()
-    FlightLog(str(path), ManualClock()).close(**SUMMARY)
-    assert [file.name for file in tmp_path.iterdir()] == ["flight.jsonl"]
+    fly(path)
+    flown = lines(path)
+    for _ in range(30):
+        log = FlightLog(str(path), ManualClock())
+        log.event("waiting", "for a camera")
+        log.close(**SUMMARY)
+    assert len(lines(path)) == 2
+    assert {file.name for file in tmp_path.iterdir()} == {"flight.jsonl", "flight.jsonl.1"}
+    assert lines(tmp_path / "flight.jsonl.1") == flown
+
+
+def test_what_points_to_the_file_stays_where_it_is(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    path = tmp_path / "flight.jsonl"
+    path.symlink_to(tmp_path / "disk" / "log")
+    for _ in range(2):
+        fly(path)
+    assert path.is_symlink()
+    assert {file.name for file in (tmp_path / "disk").iterdir()} == {"log", "log.1"}
 
 
 def test_where_an_earlier_flight_cannot_be_moved_this_one_follows_it(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "flight.jsonl"
-    FlightLog(str(path), ManualClock()).close(**SUMMARY)
+    fly(path)
     (tmp_path / "flight.jsonl.19").touch()
     (tmp_path / "flight.jsonl.20").mkdir()  # in the way, and nothing to be removed as a file
+    n_lines = len(lines(path))
     log = FlightLog(str(path), ManualClock())
     log.event("again", "")
     log.close(**SUMMARY)
-    assert [line["kind"] for line in lines(path)] == ["summary", "event", "summary"]
+    assert [line["kind"] for line in lines(path)[n_lines:]] == ["event", "summary"]
     assert "goes on where it was" in caplog.text
 
 

@@ -89,6 +89,22 @@ def test_the_oldest_revisions_go_when_there_is_no_room_for_them(tmp_path: Path) 
     assert set(tmp_path.iterdir()) == left
 
 
+def test_what_this_flight_wrote_is_newest_whatever_the_clock_says(tmp_path: Path) -> None:
+    maps = MapStore(str(tmp_path), kept_bytes=2 * len(DATA))
+    tomorrow = tmp_path / f"{1:016x}.vclmap"
+    tomorrow.write_bytes(DATA)
+    os.utime(tomorrow, ns=(1 << 62, 1 << 62))
+    other = encode_map(decode_map(demo.encoded_map(1, 2, 3)))
+    stored = [
+        maps.replace(data, index)
+        for data, index in ((other, demo.map_index(1, 2, 3)), (DATA, INDEX))
+    ]
+    for one in stored:
+        maps.keep(one)
+        assert (tmp_path / f"{one.revision.hex()}.vclmap").exists()
+    assert not tomorrow.exists()
+
+
 def test_the_newest_revision_stays_however_large_it_is(tmp_path: Path) -> None:
     maps = MapStore(str(tmp_path), kept_bytes=1)
     maps.keep(maps.replace(DATA, INDEX))

@@ -13,7 +13,6 @@ import pytest
 from tests.daemon import demo
 from tests.daemon.waiting import run
 from vcl_companion.daemon import feature_memory
-from vcl_companion.daemon.forked import ProcessLostError
 from vcl_companion.daemon.map_offer import MapOffer
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.map_work import MapWork
@@ -212,9 +211,6 @@ def test_a_lost_process_is_replaced_by_threads() -> None:
         await work.ready(MapOffer.of(BlobKind.MAP, PAIR), None, {})
         os.kill(pid, signal.SIGKILL)
         frames = [demo.answer(system_id, 12) for system_id in (1, 2, 3)]
-        # Had it died of these, this process would.
-        with pytest.raises(ProcessLostError):
-            await work.next_revision(pair(), frames, at_once=False)
         # It knew this map, its successor does not.
         built = await work.next_revision(pair(), frames, at_once=False)
         assert isinstance(built, LandmarkMap)

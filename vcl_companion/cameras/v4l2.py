@@ -28,9 +28,11 @@ from vcl_companion.errors import DeviceError
 _log = logging.getLogger(__name__)
 
 _STALLED_AFTER_S = 2
-_MAX_FAILURES = 5
-# A device that is gone says so at once, each time that it is asked.
-_PAUSE_S = 0.02
+# Without a frame, as a multiple of that: before the service's watchdog ends it less cleanly.
+_GIVES_UP = 6.0
+# A device that is gone says so at once, each time that it is asked. While it is held open it
+# comes back under another name.
+_MOST_UNREADABLE, _PAUSE_S = 5, 0.02
 _OLDEST_STAMP_NS = 2_000_000_000
 # Drivers that convert the device's clock into the host's may overshoot a little.
 _NEWEST_STAMP_NS = -10_000_000
@@ -73,14 +75,16 @@ class V4l2Camera:
             size_px: the (width, height) that frames must have.
             time_offset_s: device timestamp to mid-exposure, s.
             clock: CLOCK_MONOTONIC.
-            patience_s: it is opened again when no frame has come for so long, s, after a quarter
-                of that, then after twice as long each time, five times in a row at most.
+            patience_s: it is opened again when no frame has come for so long, s, or five reads in
+                a row have failed: after a quarter of that, then after twice as long each time,
+                until there has been none for six times as long.
         """
         self._name, self._open_capture, self._size_px = name, open_capture, size_px
         self._offset_ns, self._clock = round(time_offset_s * 1e9), clock
         self._patience_s = patience_s
         # Of the reader's thread, however often the device is opened.
         self._sequence, self._last_ns, self._is_stamped = -1, -1, True
+        self._came_at_ns = 0
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._arrived = asyncio.Event()
@@ -153,16 +157,18 @@ class V4l2Camera:
                     raise
                 why = str(error).removeprefix(f"camera {self._name}: ")
             failures = 1 if self._sequence > before else failures + 1
+            pause_s = self._patience_s * 2.0 ** (failures - 3)
+            silent_s = (self._clock.now_ns() - self._came_at_ns) * 1e-9
             if self._stop.is_set():
                 return
-            if self._sequence < 0 or failures >= _MAX_FAILURES:
+            if self._sequence < 0 or silent_s + pause_s > _GIVES_UP * self._patience_s:
                 raise DeviceError(f"camera {self._name}: {why}")
             _log.warning("camera %s: %s; opening it again", self._name, why)
-            self._stop.wait(self._patience_s * 2.0 ** (failures - 3))
+            self._stop.wait(pause_s)
 
     def _read_frames(self, capture: Capture, loop: asyncio.AbstractEventLoop) -> None:
         """Read until told to stop, or until nothing has come for too long."""
-        came_at_ns = self._clock.now_ns()
+        since_ns, n_unreadable = self._clock.now_ns(), 0
         while not self._stop.is_set():
             try:
                 complete, image = capture.read()
@@ -172,11 +178,14 @@ class V4l2Camera:
             received_at_ns = self._clock.now_ns()
             if not complete:
                 # An image that cannot be decoded comes as none, and the next may be whole.
-                if received_at_ns - came_at_ns >= self._patience_s * 1e9:
+                n_unreadable += 1
+                is_over = received_at_ns - since_ns >= self._patience_s * 1e9
+                if is_over or n_unreadable == _MOST_UNREADABLE:
                     return
                 self._stop.wait(_PAUSE_S)
                 continue
-            came_at_ns = received_at_ns
+            since_ns = self._came_at_ns = received_at_ns
+            n_unreadable = 0
             self._sequence += 1
             if image.ndim == 3:
                 image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)

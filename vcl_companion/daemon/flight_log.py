@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
@@ -15,7 +16,7 @@ import numpy as np
 
 from vcl_companion.cameras.source import Outcome
 from vcl_companion.clock import Clock
-from vcl_companion.errors import ConfigError
+from vcl_companion.errors import DISK_IS_FULL, ConfigError
 from vcl_companion.geometry.pose import Pose, euler_pose_covariance
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.fix import Recognised
@@ -34,16 +35,18 @@ _UPPER = np.triu_indices(6)
 # Reasons hold numbers, and some are a peer's words: beyond so many they share one count.
 _MAX_REASONS = 200
 _OTHER_REASONS = "other reasons"
-# Of earlier runs: a daemon that fails again and again is started again every twenty seconds.
+# Of earlier runs, those that had frames: a service that does not come up is started again and
+# again, every second or every twenty, and may not shift out the flight that it was to go on with.
 _MOST_KEPT = 20
+_FRAME, _LOOKED_THROUGH_BYTES = b'{"kind": "frame"', 1 << 20
 
 
 class FlightLog:
     """Writes one line per frame, event and map; counts frames even when no file is kept.
 
     Args:
-        path: the file, empty for none. What earlier runs wrote there is kept beside it: the last
-            one's as ``path.1``, the one's before as ``path.2``, to ``path.20``.
+        path: the file, empty for none. What earlier runs wrote there of frames is kept beside it:
+            the last one's as ``path.1``, the one's before as ``path.2``, to ``path.20``.
         clock: stamps events.
 
     Raises:
@@ -62,7 +65,9 @@ class FlightLog:
                 self._file = open(path, "a", encoding="utf-8", buffering=1)  # noqa: SIM115 kept open
             except (OSError, ValueError) as error:
                 why = getattr(error, "strerror", None) or error
-                raise ConfigError(f"[log] flight_log {path!r}: {why}") from error
+                if getattr(error, "errno", None) not in DISK_IS_FULL:
+                    raise ConfigError(f"[log] flight_log {path!r}: {why}") from error
+                _log.error("no flight log is kept in %s: %s", path, why)
 
     def frame(
         self,
@@ -197,12 +202,17 @@ def _keep_earlier(path: str) -> None:
 
     Where it cannot be moved this run's lines follow it: a restart in the air fails by nothing here.
     """
-    # No device, and no folder, is moved.
-    if not (Path(path).is_file() and Path(path).stat().st_size):
+    there = Path(path).resolve()  # not what points to it, perhaps on another disk
+    if not there.is_file():
         return
-    earlier = RotatingFileHandler(path, backupCount=_MOST_KEPT, delay=True)
+    earlier = RotatingFileHandler(there, backupCount=_MOST_KEPT, delay=True)
     try:
-        earlier.doRollover()
+        with there.open("rb") as file:
+            has_flown = _FRAME in file.read(_LOOKED_THROUGH_BYTES)
+        if has_flown:
+            earlier.doRollover()
+        else:
+            os.truncate(there, 0)
     except OSError as error:
         _log.warning("[log] flight_log %r goes on where it was: %s", path, error.strerror)
     finally:

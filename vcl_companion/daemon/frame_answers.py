@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -27,8 +29,11 @@ from vcl_companion.wire.messages import FrameRequest
 
 _log = logging.getLogger(__name__)
 
-# Only a coordinator asks; while the swarm does not agree who that is there may be two.
+# Only a coordinator asks; where not all hear each other, or do not agree yet who that is, there may
+# be several. Who is not ours is given a frame now and then: each costs as much as ten seconds of
+# all else that is said.
 _MAX_ASKERS = 4
+_OTHERS_EVERY_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -111,13 +116,36 @@ class FrameAnswers:
         self._wanted: PeerMailbox[_Wanted] = PeerMailbox()
         self._given: dict[int, _Given] = {}
         self._on_its_way: dict[int, tuple[int, ...]] = {}
+        self._of_others: dict[int, tuple[int, float]] = {}  # members' that do not coordinate
 
-    def want(self, peer: int, request: FrameRequest) -> None:
-        """Take a peer's request; a newer one of the same peer replaces it."""
+    def want(self, peer: int, request: FrameRequest, *, leads: bool) -> bool:
+        """Take a peer's request; a newer one of the same peer replaces it.
+
+        Args:
+            peer: who asks.
+            request: for which frame.
+            leads: whether it is our coordinator, as far as we know.
+
+        Returns:
+            Whether it was taken: others may ask again, but for another frame not so soon.
+        """
+        if not leads and not self._is_time_for(peer, request.request_id):
+            return False
         instant = self._clocks.instant(
             peer, request.at_ns, request.frame_age_s, self._clock.now_ns()
         )
         self._wanted.put(peer, _Wanted(request.request_id, instant))
+        return True
+
+    def _is_time_for(self, peer: int, request_id: int) -> bool:
+        """Whether who does not coordinate may ask for this frame now."""
+        now_s = asyncio.get_running_loop().time()
+        last_id, taken_at_s = self._of_others.get(peer, (None, -math.inf))
+        if request_id != last_id and now_s < taken_at_s + _OTHERS_EVERY_S:
+            return False
+        if request_id != last_id:
+            self._of_others[peer] = request_id, now_s
+        return True
 
     async def run(self) -> None:
         """Answer until cancelled."""

@@ -9,11 +9,12 @@ import os
 import re
 import tempfile
 from collections import deque
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vcl_companion.errors import ConfigError
+from vcl_companion.errors import DISK_IS_FULL, ConfigError
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.mapping.templates import Templates
 from vcl_companion.wire.map_codec import REVISION_BYTES, revision_of
@@ -91,6 +92,7 @@ class MapStore:
 
     def __init__(self, directory: str, kept_bytes: int = _KEPT_BYTES) -> None:
         self._kept_bytes = kept_bytes
+        self._written: dict[Path, int] = {}  # in this run, and their order
         self.current: StoredMap | None = None
         self.is_improved = False
         """Whether the one in use has had a better index made of it since it came."""
@@ -107,7 +109,9 @@ class MapStore:
                     pass
             except (OSError, ValueError) as error:
                 why = getattr(error, "strerror", None) or error
-                raise ConfigError(f"[map] directory {directory!r}: {why}") from error
+                if getattr(error, "errno", None) not in DISK_IS_FULL:
+                    raise ConfigError(f"[map] directory {directory!r}: {why}") from error
+                _log.error("no map can be kept in %s: %s", directory, why)
 
     def replace(
         self,
@@ -191,7 +195,8 @@ class MapStore:
         path = self._directory / f"{stored.revision.hex()}.vclmap"
         try:
             _write_whole(path, stored.data)
-            _remove_oldest(self._directory, self._kept_bytes)
+            self._written[path] = len(self._written)
+            _remove_oldest(self._directory, self._kept_bytes, self._written)
         except OSError as error:
             _log.error("the map %s cannot be kept: %s", path, error.strerror)
 
@@ -233,20 +238,29 @@ class MapStore:
             self.saved_file.unlink(missing_ok=True)
 
 
-def _remove_oldest(directory: Path, kept_bytes: int) -> None:
+def _remove_oldest(directory: Path, kept_bytes: int, written: Mapping[Path, int]) -> None:
     """Remove what is beyond so many bytes of revisions, but never the newest one.
+
+    Args:
+        directory: where they are.
+        kept_bytes: of all of them.
+        written: those of this run, in their order: newer than all others, whatever a clock
+            says that was not set yet, then or now.
 
     Raises:
         OSError: that has failed.
     """
     # By revision: the saved one, and whatever else is there, is not ours to remove.
-    files = [file for file in directory.glob("*.vclmap") if _REVISION.fullmatch(file.stem)]
-    found = [(file.stat(), file) for file in files]
-    newest_first = sorted(found, key=lambda one: one[0].st_mtime_ns, reverse=True)
+    found = []
+    for file in directory.glob("*.vclmap"):
+        if _REVISION.fullmatch(file.stem):
+            with suppress(FileNotFoundError):
+                found.append((written.get(file, -1), file.stat(), file))
+    found.sort(key=lambda one: (one[0], one[1].st_mtime_ns), reverse=True)
     n_bytes = 0
-    for status, file in newest_first:
+    for k, (_, status, file) in enumerate(found):
         n_bytes += status.st_size
-        if n_bytes > kept_bytes and file != newest_first[0][1]:
+        if n_bytes > kept_bytes and k > 0:
             file.unlink(missing_ok=True)
 
 

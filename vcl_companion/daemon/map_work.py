@@ -42,11 +42,6 @@ _OWN, _SPARE = "own", "spare"
 _LANES = {_FIRST: 2, _OWN: 2, _MAPS: 8, _IMAGES: 4, _FRAMES: 8, _PEERS: 12, _SPARE: 12}
 
 
-# What takes most memory, or looks at images of peers': if a process has died of it, this one,
-# which flies, is not to do the same. Who asks for it takes any error for no map.
-_NOT_AGAIN = frozenset(("first_map", "next_revision", "merged", "look_at"))
-
-
 class MapWork:
     """Has a workshop do things; each method waits for what its namesake returns or raises.
 
@@ -219,8 +214,6 @@ class MapWork:
                     _log.error("the process that makes maps was lost; threads go on with it")
                     self._process = None
                     process.end()
-                if method in _NOT_AGAIN:
-                    raise
         if lane not in self._threads:
             self._threads[lane] = Worker(lane, _LANES[lane])
         do = getattr(self._workshop, method)

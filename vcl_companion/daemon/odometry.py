@@ -94,6 +94,10 @@ class Odometry:
         """The local map in use, if there is one."""
         return None if self._local is None else self._local.templates
 
+    def templates_in(self, world: tuple[bytes, int]) -> Templates | None:
+        """Return the local map in use, if there is one and its poses are in a world (``note``)."""
+        return self.templates if world == self._world else None
+
     async def begun(self, world: tuple[bytes, int]) -> Templates | None:
         """Return the local map; without one, one of the last frames, made now if it can be.
 

@@ -120,10 +120,11 @@ class OwnFixes:
 
     async def _by_odometry(self, frame: Frame, on_map: Look) -> Look | None:
         """Look at a frame by our own last frames, if these may tell more; None if they do not."""
-        local = self._odometry.templates
+        world = self._world_of(on_map.stored)
+        local = self._odometry.templates_in(world)
         at_ns, ned_from_body = frame.captured_at_ns, on_map.ned_from_body
         if local is None and isinstance(on_map.fix, NotLocalized):
-            local = await self._odometry.begun(self._world_of(on_map.stored))
+            local = await self._odometry.begun(world)
         if local is None or not self._odometry.may_tell_more(on_map.fix):
             return None
         predicted = self._estimator.predicted(at_ns, ned_from_body)

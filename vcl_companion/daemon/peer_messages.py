@@ -87,10 +87,9 @@ class PeerMessages:
                 # Most say what was said before, and in a large swarm that would be all the work.
                 return self._presence.map_state(peer, message)
             case FrameRequest():
-                if not self._group.may_lead(peer):
-                    self._refusals.count(peer, "a frame asked for by who does not coordinate")
+                if not self._answers.want(peer, message, leads=self._group.may_lead(peer)):
+                    self._refusals.count(peer, "frames asked for too often for no coordinator")
                     return False
-                self._answers.want(peer, message)
             case MapRefused():
                 if peer == self._group.coordinator:
                     self._maps.refuse(message.reason)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import errno
 import logging
 import os
 from collections.abc import Callable
@@ -11,7 +10,7 @@ from concurrent.futures import Executor
 from pathlib import Path
 
 from vcl_companion.clock import Moment, system_moment
-from vcl_companion.errors import ConfigError
+from vcl_companion.errors import DISK_IS_FULL, ConfigError
 from vcl_companion.links.key_file import read_key_file
 from vcl_companion.links.signing import Signing, SigningOptions
 from vcl_companion.links.swarm_time import TICKS_PER_S, SwarmTime
@@ -25,7 +24,7 @@ _RENEWED_TICKS = 5 * TICKS_PER_S
 # Who ends may still say something; who is started again at once must not be far ahead.
 _END_TICKS = TICKS_PER_S
 _LOOK_S = 0.5
-_DISK_IS_FULL = os.strerror(errno.ENOSPC)
+_DISK_IS_FULL = frozenset(map(os.strerror, DISK_IS_FULL))
 
 
 class KeptSigning:
@@ -71,7 +70,7 @@ class KeptSigning:
         self.signing = Signing(key, SwarmTime(left.reserved, now()), left.streams, options)
         self._reserved = left.reserved
         why = "" if self._file is None else self._file.write(self._ahead())
-        if why == _DISK_IS_FULL:  # a restart in the air is part of the flight
+        if why in _DISK_IS_FULL:  # a restart in the air is part of the flight
             _log.error("%s: timestamps of signed frames cannot be kept: %s", timestamp_file, why)
         elif why:
             raise ConfigError(

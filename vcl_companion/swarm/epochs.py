@@ -50,7 +50,10 @@ def _next_of(own_id: int, epoch: int) -> int:
 
 
 class Epochs:
-    """The highest epoch of each team that one drone knows; they never go back.
+    """The highest epoch of each team that one drone knows.
+
+    Among honest drones they never go back. A wrong one that lifts them by nearly half of all can
+    have them go round; who takes the next is above all the same.
 
     Args:
         own_id: this drone.
