@@ -212,3 +212,32 @@ def test_a_time_that_is_none_is_refused(within: str) -> None:
     result = CliRunner().invoke(main, ["ground", "pause", "--within", within])
     assert result.exit_code == 2
     assert "--within" in result.output
+
+
+def test_what_ends_who_listens_is_not_waited_out() -> None:
+    class PipeIsClosedError(Exception):
+        pass
+
+    def tell(_: Told) -> None:
+        raise PipeIsClosedError
+
+    async def scenario() -> None:
+        (port,) = free_ports(1)
+        link = f"udpin:127.0.0.1:{port}"
+        ordering = Ordering(ORDERS["update-map"], [link], (), 60.0, tell)
+        async with udp() as side:
+            companion = Companion(side, 1, [(IN_PROGRESS, 0)], 0, UPDATE_MAP, ())
+            async with running(companion.run(("127.0.0.1", port))), asyncio.timeout(20.0):
+                with pytest.raises(PipeIsClosedError):
+                    await ordering.run()
+                # What was ordered is cancelled all the same.
+                while [first for first, _ in companion.orders] != [0.0, 1.0]:
+                    await asyncio.sleep(0.05)
+
+    asyncio.run(scenario())
+
+
+def test_a_host_that_cannot_be_is_said_to_be_none() -> None:
+    ordering = Ordering(ORDERS["pause"], ["udp:192.168.1..5:14550"], (), 1.0, lambda _: None)
+    with pytest.raises(DeviceError, match="is not heard"):
+        asyncio.run(ordering.run())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from tests.mapping.views import map_of
 from tests.scenes import facade_scene, observe
@@ -42,3 +43,18 @@ def test_too_few_landmarks_decide_everything() -> None:
     seen = np.flatnonzero(np.isfinite(views.ideal[..., 0]).all(axis=1))[:3]
     few = replace(views, points=views.points[seen], ideal=views.ideal[seen])
     np.testing.assert_array_equal(leverages(few), 1.0)
+
+
+@pytest.mark.parametrize("n_seen", [0, 1, 2])
+def test_a_view_that_sees_hardly_any_takes_nobody_with_it(n_seen: int) -> None:
+    scene = facade_scene(np.random.default_rng(5), 150, relief_m=4.0, n_views=3)
+    views = views_of(map_of(scene))
+    ideal = views.ideal.copy()
+    ideal[n_seen:, 2] = np.nan
+    enough = np.isfinite(ideal[..., 0]).sum(axis=1) >= 2
+    weak = replace(
+        views, ideal=ideal[enough], points=views.points[enough], slopes=views.slopes[enough]
+    )
+    shares = leverages(weak)
+    assert shares.max() < 0.25
+    assert np.median(shares) > 0.0

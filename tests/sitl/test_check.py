@@ -244,6 +244,13 @@ def test_wrong_parameters_are_named_mended_and_put_back(tmp_path: Path) -> None:
             assert line.endswith(f"set it to {advice}")
         assert check(config, "--fix", answer="n\n").exit_code == 1
         assert not kept.exists()
+        # What they were is kept before anything is set, or nothing is.
+        kept.mkdir()
+        unkept = check(config, "--fix", "--yes")
+        assert unkept.exit_code == 2
+        assert "one.parameters.json: Is a directory" in unkept.output
+        assert "EK3_SRC1_POSXY" in check(config).output
+        kept.rmdir()
         mended = check(config, "--fix", answer="y\n")
         assert mended.exit_code == 0, mended.output
         assert json.loads(kept.read_text()) == wrong

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -62,8 +62,9 @@ def run(config_path: Path) -> None:
     # A worker may still be deep in OpenCV. The interpreter, ending, would cut its thread
     # off there, which C++ answers with an abort; everything is closed and flushed by now.
     logging.shutdown()
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:  # as of a program that was started without
+            stream.flush()
     os._exit(status)
 
 
@@ -111,7 +112,7 @@ def check(
 
     from vcl_companion.config import load_config
     from vcl_companion.daemon.check import check_all, outcome_json, set_parameters
-    from vcl_companion.daemon.parameter_backup import read_before, write_before
+    from vcl_companion.daemon.parameter_backup import forget_before, read_before, write_before
 
     if sum((as_json, fix, restore)) > 1:
         raise ConfigError("check: --json, --fix and --restore are each for themselves")
@@ -121,7 +122,8 @@ def check(
     if restore:
         wanted = read_before(kept)
     else:
-        asks = sys.stdin.isatty() and not (as_json or yes)
+        is_there = sys.stdin is not None and sys.stdin.isatty()
+        asks = is_there and not (as_json or yes)
         tilt = tilt or (asks and click.confirm("Turn the drone by hand, to check its axes?"))
         outcome = asyncio.run(check_all(config, _ask_for_tilt if tilt else None))
         if as_json:
@@ -137,12 +139,16 @@ def check(
         click.echo(f"{name} = {value:g}")
     if not yes and not click.confirm("Set these in the autopilot?"):
         context.exit(1)
-    before, failed = asyncio.run(set_parameters(config, wanted))
-    if restore and not failed:
-        kept.unlink()
-    elif not restore and before:
+
+    def keep(before: Mapping[str, float]) -> None:
+        if restore:
+            return
         write_before(kept, before)
         click.echo(f"{kept}: what they were; --restore puts it back")
+
+    failed = asyncio.run(set_parameters(config, wanted, keep))
+    if restore and not failed:
+        forget_before(kept)
     for name in failed:
         click.echo(f"vcl: {name}: the autopilot did not take it", err=True)
     click.echo("Restart the autopilot: some take effect only then.")

@@ -66,31 +66,39 @@ async def check_all(config: Config, tilt: Callable[[], None] | None = None) -> O
     checks.append(await of_camera(config, clock))
     async with _linked(config, clock) as link:
         more, wrong = await of_autopilot(config, link)
-        if tilt is not None and link.firmware is not Firmware.OTHER:
+        if tilt is not None and link.has_been_heard:
             more += await _of_axes(config, link, clock, tilt)
     return Outcome((*checks, *more), tuple(wrong))
 
 
 async def set_parameters(
-    config: Config, values: Mapping[str, float]
-) -> tuple[dict[str, float], list[str]]:
+    config: Config,
+    values: Mapping[str, float],
+    keep: Callable[[Mapping[str, float]], None],
+) -> list[str]:
     """Set parameters of the autopilot.
 
+    Args:
+        config: of the daemon.
+        values: what they shall be.
+        keep: given what they were, before the first is set; what it raises leaves them so.
+
     Returns:
-        what each was before, and the names of those that did not take their value.
+        The names of those that did not take their value.
     """
-    before: dict[str, float] = {}
-    failed = []
     async with _linked(config, SystemClock()) as link:
         await _heard_of(link)
-        for name, value in values.items():
-            was = await link.parameter(name)
-            now = None if was is None else await link.set_parameter(name, value)
-            if was is None or now is None or abs(now - value) > 1e-5 * max(1.0, abs(value)):
+        asked = {name: await link.parameter(name) for name in values}
+        before = {name: was for name, was in asked.items() if was is not None}
+        if before:
+            keep(before)
+        failed = [name for name in values if name not in before]
+        for name in before:
+            value = values[name]
+            now = await link.set_parameter(name, value)
+            if now is None or abs(now - value) > 1e-5 * max(1.0, abs(value)):
                 failed.append(name)
-            else:
-                before[name] = was
-    return before, failed
+    return failed
 
 
 def outcome_json(outcome: Outcome) -> str:
@@ -121,9 +129,9 @@ async def _linked(config: Config, clock: Clock) -> AsyncIterator[AutopilotLink]:
 async def _heard_of(link: AutopilotLink) -> bool:
     """Wait for the autopilot's first heartbeat; whether it came."""
     deadline_s = time.monotonic() + _HEARTBEAT_S
-    while link.firmware is Firmware.OTHER and time.monotonic() < deadline_s:
+    while not link.has_been_heard and time.monotonic() < deadline_s:
         await asyncio.sleep(0.1)
-    return link.firmware is not Firmware.OTHER
+    return link.has_been_heard
 
 
 async def _of_axes(

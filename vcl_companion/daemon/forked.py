@@ -61,8 +61,9 @@ class Forked:
 
     def __init__(self, target: object, lanes: Mapping[str, int], *, realtime: bool = False) -> None:
         self._socket, other = socket.socketpair()
-        sys.stdout.flush()
-        sys.stderr.flush()
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:
+                stream.flush()
         self.pid = os.fork()
         if self.pid == 0:
             self._socket.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -20,9 +21,26 @@ def write_before(path: Path, before: Mapping[str, float]) -> None:
     try:
         kept = read_before(path) if path.exists() else {}
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps({**before, **kept}, indent=1) + "\n", encoding="utf-8")
+        fresh = path.with_name(f".{path.name}.new")
+        with open(fresh, "w", encoding="utf-8") as file:
+            file.write(json.dumps({**before, **kept}, indent=1) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(fresh, path)
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from error
+        raise ConfigError(f"{path}: {error.strerror or error}: nothing is changed") from error
+
+
+def forget_before(path: Path) -> None:
+    """Remove what was kept: it has been put back.
+
+    Raises:
+        ConfigError: it cannot be removed.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}: remove it by hand") from error
 
 
 def read_before(path: Path) -> dict[str, float]:

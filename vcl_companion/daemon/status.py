@@ -111,11 +111,11 @@ def read_status(path: Path) -> ServiceStatus:
             data = file.read(_MAX_FILE_BYTES)
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: is not there; is the service running?") from error
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from error
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
     try:
         return msgspec.json.decode(data, type=ServiceStatus)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: is no status of a service ({error})") from error
 
 

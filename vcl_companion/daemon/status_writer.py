@@ -68,9 +68,10 @@ class StatusWriter:
             try:
                 await loop.run_in_executor(self._executor, write_status, self._path, self.status())
                 is_told = False
-            except OSError as error:
+            except (OSError, ValueError) as error:
                 if not is_told:
-                    _log.warning("%s: %s: no status is written", self._path, error.strerror)
+                    why = getattr(error, "strerror", None) or error
+                    _log.warning("%s: %s: no status is written", self._path, why)
                 is_told = True
             await asyncio.sleep(_EVERY_S)
 

@@ -134,6 +134,7 @@ class Ordering:
         self._answers: dict[int, CommandAck] = {}
         self._shown: dict[int, str] = {}
         self._texts: dict[int, str] = {}
+        self._untold: asyncio.Future[None] | None = None
 
     async def run(self) -> bool:
         """Have them do it; return whether all of them have done it.
@@ -145,9 +146,19 @@ class Ordering:
         for line in self._lines:
             work = line.transport.run(partial(self._receive, line), self._greet)
             beside.append(asyncio.ensure_future(work))
+        ordering = asyncio.ensure_future(self._ordered())
+        self._untold = asyncio.get_running_loop().create_future()
         try:
-            return await self._ordered()
+            # None of those beside ends by itself: what ends one is not to be waited out.
+            endless: list[asyncio.Future[None]] = [*beside, self._untold]
+            await asyncio.wait([ordering, *endless], return_when=asyncio.FIRST_COMPLETED)
+            for one in endless:
+                if one.done():
+                    one.result()
+            return await ordering
         finally:
+            ordering.cancel()
+            await asyncio.gather(ordering, return_exceptions=True)  # it cancels what it has ordered
             for task in beside:
                 task.cancel()
             await asyncio.gather(*beside, return_exceptions=True)
@@ -156,6 +167,7 @@ class Ordering:
         drones = await self._found()
         order = self._order
         self._texts.clear()
+        self._answers.clear()  # to an order before, or of somebody else's
         try:
             with suppress(TimeoutError):
                 async with asyncio.timeout(self._within_s):
@@ -225,6 +237,14 @@ class Ordering:
                     self._take(message)
         return True
 
+    def _show(self, told: Told) -> None:
+        """Show what has come; what that raises ends the order, and not the link."""
+        try:
+            self._tell(told)
+        except Exception as error:  # as of a pipe that is closed
+            if self._untold is not None and not self._untold.done():
+                self._untold.set_exception(error)
+
     def _hear(self, said: StatusText) -> None:
         """Keep a drone's last warning: it says why it does not do what it was told to."""
         before = self._texts.get(said.sender_system, "") if said.chunk > 0 else ""
@@ -248,7 +268,7 @@ class Ordering:
             told = Told(drone, text, is_over=True, is_good=answer.result == RESULT_ACCEPTED)
         if self._shown.get(drone) != told.text:
             self._shown[drone] = told.text
-            self._tell(told)
+            self._show(told)
 
     def _text_of(self, answer: CommandAck) -> str:
         text = {

@@ -106,6 +106,8 @@ class AutopilotLink:
         for told in self._told_firmware:
             told.firmware = self._firmware
         self._mode = VehicleMode()
+        self.has_been_heard = False
+        """Whether any heartbeat of it has come."""
         self._silent_s = 0.0
 
     @property
@@ -247,6 +249,7 @@ class AutopilotLink:
             case GlobalOrigin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude):
                 self.origin.said(GlobalPlace(latitude, longitude, altitude))
             case Heartbeat():
+                self.has_been_heard = True
                 if self._silent_s >= _SILENT_S:
                     _log.info("the autopilot is heard")
                 self._silent_s = 0.0

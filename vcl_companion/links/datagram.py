@@ -8,7 +8,7 @@ import ipaddress
 import socket
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from vcl_companion.links.counters import LinkTally
 from vcl_companion.links.reconnect import (
@@ -17,6 +17,7 @@ from vcl_companion.links.reconnect import (
     LinkLostError,
     OnBytes,
     Reconnecting,
+    addresses_of,
 )
 
 _MAX_DATAGRAM_BYTES = 65535
@@ -49,7 +50,7 @@ class DatagramTransport(Reconnecting):
     async def _serve(self, on_bytes: OnBytes, on_connected: Callable[[], None]) -> None:
         try:
             opened = await self._open()
-        except OSError as error:
+        except (OSError, ValueError) as error:  # a host name may be none
             raise LinkLostError(f"cannot open: {error}") from error
         with opened:
             opened.setblocking(False)
@@ -240,16 +241,23 @@ class PeerSocket(DatagramTransport):
 
 
 async def _first_address(
-    host: str, port: int, use: Callable[[socket.socket, Address], None]
+    host: str, port: int, use: Callable[[socket.socket, Any], None]
 ) -> socket.socket:
-    """Return a UDP socket that is bound or connected to the first address of a name."""
-    loop = asyncio.get_running_loop()
-    found = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
-    family, kind, protocol, _, address = found[0]
-    opened = socket.socket(family, kind, protocol)
-    with _closed_on_error(opened):
-        use(opened, (str(address[0]), int(address[1])))
-    return opened
+    """Return a UDP socket that is bound or connected to an address of a name.
+
+    Of IPv4 where it has one: ``localhost`` is both, and most that speak MAVLink know the one only.
+    """
+    failure: OSError | None = None
+    for family, kind, protocol, _, address in await addresses_of(host, port, socket.SOCK_DGRAM):
+        opened = socket.socket(family, kind, protocol)
+        try:
+            with _closed_on_error(opened):
+                use(opened, address)
+        except OSError as error:
+            failure = failure or error
+        else:
+            return opened
+    raise failure or OSError(f"{host} has no address")
 
 
 @contextlib.contextmanager

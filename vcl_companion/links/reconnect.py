@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from vcl_companion.links.counters import LinkTally
 
@@ -17,6 +19,17 @@ Address = tuple[str, int]
 
 OnBytes = Callable[[bytes, Address | None], bool]
 """Takes what arrived, and from where if it was a datagram; says whether any was accepted."""
+
+
+async def addresses_of(host: str, port: int, kind: socket.SocketKind) -> list[Any]:
+    """Return what ``getaddrinfo`` says of a host, IPv4 first.
+
+    Raises:
+        OSError: it is not known.
+        ValueError: no host has such a name.
+    """
+    found = await asyncio.get_running_loop().getaddrinfo(host, port, type=kind)
+    return sorted(found, key=lambda one: one[0] != socket.AF_INET)
 
 
 class LinkLostError(Exception):

@@ -15,7 +15,13 @@ from typing import ClassVar, Protocol
 import serial
 
 from vcl_companion.links.counters import LinkTally
-from vcl_companion.links.reconnect import Backoff, LinkLostError, OnBytes, Reconnecting
+from vcl_companion.links.reconnect import (
+    Backoff,
+    LinkLostError,
+    OnBytes,
+    Reconnecting,
+    addresses_of,
+)
 
 _CONNECT_TIMEOUT_S = 5.0
 _MAX_READ_BYTES = 65536
@@ -141,19 +147,25 @@ class TcpTransport(StreamTransport):
     async def _open(self) -> _Device:
         loop = asyncio.get_running_loop()
         async with asyncio.timeout(_CONNECT_TIMEOUT_S):
-            found = await loop.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
-            family, kind, protocol, _, address = found[0]
-            connection = socket.socket(family, kind, protocol)
-            try:
-                connection.setblocking(False)
-                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 3)
-                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
-                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
-                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 5000)
-                await loop.sock_connect(connection, address)
-            except BaseException:
-                connection.close()
-                raise
-        return connection
+            failure: OSError | None = None
+            found = await addresses_of(self._host, self._port, socket.SOCK_STREAM)
+            for family, kind, protocol, _, address in found:
+                connection = socket.socket(family, kind, protocol)
+                try:
+                    connection.setblocking(False)
+                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 3)
+                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 5000)
+                    await loop.sock_connect(connection, address)
+                except OSError as error:
+                    connection.close()
+                    failure = failure or error
+                except BaseException:
+                    connection.close()
+                    raise
+                else:
+                    return connection
+            raise failure or OSError(f"{self._host} has no address")

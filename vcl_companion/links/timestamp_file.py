@@ -72,7 +72,7 @@ class TimestampFile:
                 data = file.read(_MAX_FILE_BYTES + 1)
         except FileNotFoundError:
             return Timestamps()
-        except OSError as error:
+        except (OSError, ValueError) as error:
             raise ConfigError(f"{self._path}: {_why(error)}") from error
         try:
             return _decode(data)

@@ -41,6 +41,7 @@ from vcl_companion.mapping.patch_table import (
     pyramids_of,
 )
 from vcl_companion.mapping.placing import Placed, place, references
+from vcl_companion.mapping.registration import MIN_SEEN
 from vcl_companion.mapping.sharpening import SETTLED_CAUCHY_PX
 from vcl_companion.mapping.thinning import spread
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
@@ -151,7 +152,24 @@ class Extension:
         table, good = self._less_ambiguous(table, good)
         table = self._measured_again(table, good, sorted(joined))
         table, good, noise_px = self._adjusted(table, 1)
+        if unsupported := self._unsupported(table, good, sorted(joined)):
+            joined = {i: at for i, at in joined.items() if i not in unsupported}
+            if not joined:
+                return None
+            observed = table.observed.copy()
+            observed[:, [self._n_keys + i for i in unsupported]] = np.nan
+            table, good, noise_px = self._adjusted(replace(table, observed=observed), 1)
         return self._growth(table, good, noise_px, sorted(joined))
+
+    def _unsupported(self, table: Table, good: Mask, joined: list[int]) -> list[int]:
+        """Return who sees too little in the end, looked at more closely than when it joined."""
+        unsupported = []
+        for i in joined:
+            n_seen = int(np.isfinite(table.observed[good, self._n_keys + i, 0]).sum())
+            if n_seen < MIN_SEEN:
+                self.reasons[i] = f"{n_seen} patches are found again, {MIN_SEEN} needed"
+                unsupported.append(i)
+        return unsupported
 
     def _start(self, joined: dict[int, Placed]) -> Table:
         """Return the old landmarks in the old keyframes and in the views that joined."""

@@ -82,8 +82,13 @@ def _placed(
     seed: int,
 ) -> dict[int, Joined] | NoMap:
     """Place a scene of several views in the map."""
-    used = sorted(scene.cams)
-    seen = {i: sightings_of(views[i], links[i], known, sure) for i in used}
+    used, links = sorted(scene.cams), list(links)
+    seen = {}
+    for i in used:
+        # A wrong match may be with a pixel that the lens cannot produce, and spoil all sums.
+        usable = sightings_of(views[i], links[i], known, sure).usable()
+        links[i] = PairMatches(links[i].a[usable], links[i].b[usable])
+        seen[i] = sightings_of(views[i], links[i], known, sure)
     start = _searched(views, links, scene, tracks, seen, known, options, seed)
     if start is None:
         return NoMap(f"its {len(used)} views share no place with the map that all agree on")

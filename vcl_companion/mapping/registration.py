@@ -28,8 +28,8 @@ from vcl_companion.mapping.visibility import MutualMatches
 _TRIED = 6
 # Of these so many, of most matches, are tried by themselves.
 _PAIRED = 2
-# A new view has to see this many landmarks in the end.
-_MIN_SEEN = 20
+MIN_SEEN = 20
+"""A new view has to see this many landmarks in the end."""
 
 
 class Registration:
@@ -228,8 +228,8 @@ class Registration:
         some = False
         for column, i in enumerate(growth.views):
             n_seen = int(growth.landmark_map.seen[:, n + column].sum())
-            if n_seen < _MIN_SEEN:
-                self._reasons[i] = f"{n_seen} landmarks agree, {_MIN_SEEN} needed"
+            if n_seen < MIN_SEEN:
+                self._reasons[i] = f"{n_seen} landmarks agree, {MIN_SEEN} needed"
                 del self._joined[i]
                 self._refuted.add(i)
                 some = True
