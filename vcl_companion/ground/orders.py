@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from vcl_companion.errors import DeviceError
 from vcl_companion.links.counters import LinkTally
@@ -150,7 +151,7 @@ class Ordering:
         self._untold = asyncio.get_running_loop().create_future()
         try:
             # None of those beside ends by itself: what ends one is not to be waited out.
-            endless: list[asyncio.Future[None]] = [*beside, self._untold]
+            endless: list[asyncio.Future[Any]] = [*beside, self._untold]
             await asyncio.wait([ordering, *endless], return_when=asyncio.FIRST_COMPLETED)
             for one in endless:
                 if one.done():
