@@ -1,6 +1,7 @@
 """Peer links among themselves, and against strangers, on loopback."""
 
 import asyncio
+import socket
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from tests.links.running import running, udp
 from tests.ports import free_ports
 from vcl_companion.clock import ManualClock, SystemClock
 from vcl_companion.errors import ConfigError
+from vcl_companion.links import datagram
 from vcl_companion.links.key_file import make_key_file
 from vcl_companion.links.messages import Tunnel
 from vcl_companion.links.peers import PeerOptions
@@ -220,6 +222,30 @@ def test_a_group_address_reaches_everybody_and_the_own_echo_is_ignored(
             }
             assert one.tunnels.empty()
             assert one.link.counters.refused["own echo"] >= 2
+
+    asyncio.run(scenario())
+
+
+def test_a_group_that_was_lost_with_its_interface_is_joined_again(
+    key: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(datagram, "_SILENT_S", 0.2)
+
+    async def scenario() -> None:
+        (port,) = free_ports(1)
+        options = PeerOptions(f"127.0.0.1:{port}", (f"239.255.42.99:{port}",), key, "")
+        drones = one, two = [Drone(options, k) for k in (1, 2)]
+        async with running(*(drone.link.run() for drone in drones)):
+            await one.hears(2)
+            for drone in drones:
+                opened = drone.link._socket._socket
+                assert isinstance(opened, socket.socket)
+                membership = socket.inet_aton("239.255.42.99") + socket.inet_aton("127.0.0.1")
+                opened.setsockopt(socket.IPPROTO_IP, socket.IP_DROP_MEMBERSHIP, membership)
+            async with asyncio.timeout(20.0):
+                while two.tunnels.empty():
+                    one.link.send(PAYLOAD_TYPE, b"again")
+                    await asyncio.sleep(0.1)
 
     asyncio.run(scenario())
 

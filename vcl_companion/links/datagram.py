@@ -23,6 +23,7 @@ from vcl_companion.links.reconnect import (
 _MAX_DATAGRAM_BYTES = 65535
 # A flood must not keep the event loop from everything else, whatever its datagrams hold.
 _MAX_BURST, _MAX_BURST_BYTES = 64, 65536
+_SILENT_S = 5.0
 
 
 class DatagramTransport(Reconnecting):
@@ -40,6 +41,9 @@ class DatagramTransport(Reconnecting):
     @abstractmethod
     async def _open(self) -> socket.socket:
         """Return a bound or connected socket."""
+
+    def _is_silent(self, opened: socket.socket) -> None:
+        """React to nothing having come for a while."""
 
     def _accepts(self, sender: Address) -> bool:
         return True
@@ -60,8 +64,13 @@ class DatagramTransport(Reconnecting):
             try:
                 self._came_up(on_connected)
                 while True:
-                    await self._readable(opened.fileno())
-                    self._receive_burst(opened, on_bytes)
+                    try:
+                        async with asyncio.timeout(_SILENT_S):
+                            await self._readable(opened.fileno())
+                    except TimeoutError:
+                        self._is_silent(opened)
+                    else:
+                        self._receive_burst(opened, on_bytes)
             finally:
                 self._socket = None
 
@@ -222,10 +231,9 @@ class PeerSocket(DatagramTransport):
 
     async def _open(self) -> socket.socket:
         host, port = self._listen
-        interface = socket.inet_aton(host)
         opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         with _closed_on_error(opened):
-            groups = [to[0] for to in self._to if ipaddress.ip_address(to[0]).is_multicast]
+            groups = self._groups()
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
             # Broadcast addresses cannot be told from hosts without the netmask; most end so.
             if groups or any(to[0].endswith(".255") for to in self._to):
@@ -233,11 +241,27 @@ class PeerSocket(DatagramTransport):
             if groups:
                 # Bound to the group, the socket hears the group and nothing else.
                 host = groups[0]
-                membership = socket.inet_aton(host) + interface
-                opened.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
-                opened.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, interface)
+                self._join(opened, host)
             opened.bind((host, port))
         return opened
+
+    def _groups(self) -> list[str]:
+        return [to[0] for to in self._to if ipaddress.ip_address(to[0]).is_multicast]
+
+    def _join(self, opened: socket.socket, group: str) -> None:
+        interface = socket.inet_aton(self._listen[0])
+        membership = socket.inet_aton(group) + interface
+        opened.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+        opened.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, interface)
+
+    def _is_silent(self, opened: socket.socket) -> None:
+        # Not even our own is heard: a network interface that went and came back is in no group.
+        for group in self._groups():
+            with contextlib.suppress(OSError):
+                membership = socket.inet_aton(group) + socket.inet_aton(self._listen[0])
+                opened.setsockopt(socket.IPPROTO_IP, socket.IP_DROP_MEMBERSHIP, membership)
+            with contextlib.suppress(OSError):  # it is not back yet
+                self._join(opened, group)
 
 
 async def _first_address(
