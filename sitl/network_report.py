@@ -4,7 +4,7 @@ Of each drone, as ``peer_link`` (None when nothing was counted):
 
 * ``by_message``: name to ``messages``, ``payload_bytes`` (of TUNNEL, without padding),
   ``wire_bytes`` (the whole MAVLink frames), ``wire_bytes_per_s`` of recording time. What
-  goes to several peers is sent, and counted, once for each.
+  all hear counts once, where it is sent to each by itself once for each.
 * the same sums over all messages.
 * ``network``: what became of it: ``offered`` datagrams are those ``lost``, ``queue_full``
   (dropped before a transmission that would have waited too long), ``cut`` (by a

@@ -21,6 +21,7 @@ _OWN_FILES = (
     *(FUSED_FILE, SAID_FILE, COMMANDED_FILE),
 )
 _OWN_REPORTS = ("report.json", "report.html")
+_OWN_FOLDERS = ("run", RECORDING_FOLDER)
 
 
 def prepare_folder(out: Path, plan: FlightPlan) -> None:
@@ -33,6 +34,9 @@ def prepare_folder(out: Path, plan: FlightPlan) -> None:
     try:
         if earlier is not None and out.resolve() == earlier.resolve():
             raise ConfigError(f"--out and --attitude are the same folder, {out}")
+        flown = plan.recording.path.resolve()
+        if any(flown.is_relative_to((out / name).resolve()) for name in _OWN_FOLDERS):
+            raise ConfigError(f"{out}: holds the recording to be flown; give another folder")
         if out.exists() and not out.is_dir():
             raise ConfigError(f"{out}: is a file; give a folder")
         if out.is_dir() and any(out.iterdir()) and not (out / _MARK).is_file():
@@ -56,6 +60,6 @@ def _remove_earlier(out: Path) -> None:
             folder.rmdir()
     for name in _OWN_REPORTS:
         (out / name).unlink(missing_ok=True)
-    for name in ("run", RECORDING_FOLDER):
+    for name in _OWN_FOLDERS:
         if (out / name).is_dir():
             shutil.rmtree(out / name)

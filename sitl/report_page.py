@@ -123,10 +123,10 @@ _LIVES_NOTE = (
     "for a drone while its daemon lived."
 )
 _NETWORK_NOTE = (
-    "What each drone sent to the others, once for each of them: the payload of TUNNEL, the whole "
-    "MAVLink frames, and the frames by drone in kB, from the start of the daemons to their end; "
-    "B/s per second of the recording. Below what became of the datagrams, by sender, and the "
-    "delay that the network gave them."
+    "What each drone sent to the others, what all hear once, with --addressed once for each of "
+    "them: the payload of TUNNEL, the whole MAVLink frames, and the frames by drone in kB, from "
+    "the start of the daemons to their end; B/s per second of the recording. Below what became "
+    "of the datagrams, by sender, and the delay that the network gave them."
 )
 
 

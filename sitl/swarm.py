@@ -133,12 +133,19 @@ class Swarm:
             FlightError: one is not ready within the time, where that is waited for.
         """
         flight_s = (at_ns - self._plan.starts_at_ns) * 1e-9
-        while self._kills and self._kills[0][0] <= flight_s:
-            await self._kill(self._named(self._kills.pop(0)[1]), at_ns)
-        started = []
-        while self._starts and self._starts[0][0] <= flight_s:
-            started.append(self._named(self._starts.pop(0)[1]))
-            await self._start_daemon(started[-1], at_ns)
+        started: list[FlyingDrone] = []
+        while True:
+            kill_s = self._kills[0][0] if self._kills else math.inf
+            start_s = self._starts[0][0] if self._starts else math.inf
+            if min(kill_s, start_s) > flight_s:
+                break
+            if kill_s <= start_s:
+                drone = self._named(self._kills.pop(0)[1])
+                started = [other for other in started if other is not drone]
+                await self._kill(drone, at_ns)
+            else:
+                started.append(self._named(self._starts.pop(0)[1]))
+                await self._start_daemon(started[-1], at_ns)
         if started and math.isinf(self._plan.options.speed):
             await self._all_connected(started)
             for drone in started:

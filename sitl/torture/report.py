@@ -114,7 +114,7 @@ def show_torture(console: Console, report: dict[str, Any], out: Path) -> None:
     for outcome, times in list(report["outcomes"].items())[:_MOST_SHOWN]:
         line(f"{times:>10}  {outcome}")
     line(f"{len(report['outcomes']):>10}  outcomes in all, see report.json")
-    rate = report["payloads_per_s"]
+    rate = max(report["payloads_per_s"], 1.0)  # of none where nothing was gone through
     line(
         f"{report['payloads']} payloads in {report['wall_s']:.0f} s, {rate:.0f} a second by "
         f"{report['processes']} process(es); 10 million take {1e7 / rate / 60:.0f} minutes"

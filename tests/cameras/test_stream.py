@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from vcl_companion.cameras.source import Frame
 from vcl_companion.cameras.stream import (
-    MAX_IMAGE_BYTES,
     Answer,
     Record,
     StreamCamera,
@@ -30,6 +29,7 @@ from vcl_companion.cameras.stream import (
 )
 from vcl_companion.clock import ManualClock, SystemClock
 from vcl_companion.errors import DeviceError, WireError
+from vcl_companion.recording.images import MAX_IMAGE_BYTES
 
 SIZE_PX = (32, 24)
 INSTANTS = st.integers(0, 2**63 - 1)

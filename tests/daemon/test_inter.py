@@ -260,7 +260,7 @@ def test_a_proposal_older_than_the_history_is_refused_and_the_log_says_why(
     run(scenario())
 
 
-@pytest.mark.parametrize("answer", ["refused", "far off", "tilted"])
+@pytest.mark.parametrize("answer", ["refused", "far off", "tilted", "vague"])
 def test_what_cannot_be_believed_leaves_the_frame_refused(tmp_path: Path, answer: str) -> None:
     async def scenario() -> None:
         async with swarm(1, 2, path=tmp_path) as members:
@@ -276,6 +276,8 @@ def test_what_cannot_be_believed_leaves_the_frame_refused(tmp_path: Path, answer
                     said: PoseProposal | PoseRefused = PoseRefused(
                         request.frame.request_id, "fog over there"
                     )
+                elif answer == "vague":
+                    said = proposal(request, truth, np.diag([1e2] * 3 + [1e-2] * 3))
                 elif answer == "far off":
                     said = proposal(request, Pose(truth.rotation, truth.translation + 40.0))
                 else:
@@ -285,7 +287,9 @@ def test_what_cannot_be_believed_leaves_the_frame_refused(tmp_path: Path, answer
                 await two.server.answered()
                 assert [o for _, o, _ in two.sources()] == ["localized", "refused"]
                 assert two.bases() == [(0, "peer"), (1, None)]  # nobody knows how fast it flies
-                if answer != "refused":
+                if answer == "vague":
+                    assert drone.exchange.refused["pose vaguer than any is proposed"] == 1
+                elif answer != "refused":
                     line = drone.lines("estimate")[-1]
                     assert line["fused"] is False
                     assert ("roll and pitch" if answer == "tilted" else "m from") in line["reason"]

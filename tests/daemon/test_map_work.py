@@ -27,7 +27,7 @@ from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import NoMap
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.wire.header import BlobKind
-from vcl_companion.wire.map_codec import encode_map, revision_of
+from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
 
 PAIR = demo.encoded_map(1, 2)
 
@@ -194,6 +194,22 @@ def test_bad_bytes_are_told_as_such(work: MapWork) -> None:
         with pytest.raises(WireError):
             await work.ready(MapOffer(BlobKind.MAP, broken, b"x" * 8, b""), None, {})
         assert await work.ready(MapOffer.of(BlobKind.MAP, PAIR), None, {})
+
+    run(check())
+
+
+def test_a_map_of_more_keyframes_than_are_flown_on_is_refused(work: MapWork) -> None:
+    made = decode_map(PAIR)
+    n = 64 // len(made.keyframes) + 1
+    many = replace(
+        made,
+        keyframes=made.keyframes * n,
+        observed_px=np.tile(made.observed_px, (1, n, 1)),
+    )
+
+    async def check() -> None:
+        with pytest.raises(ValueError, match=r"a map of \d+ keyframes, at most 64"):
+            await work.ready(MapOffer.of(BlobKind.MAP, encode_map(many)), None, {})
 
     run(check())
 

@@ -55,6 +55,15 @@ def frame_of(drone_id: int, image: bytes) -> FrameAnswer:
     return replace(small_frame(), drone_id=drone_id, image_bytes=image)
 
 
+def test_a_frame_from_beyond_what_can_be_told_is_not_passed_on() -> None:
+    one = Member(1)
+    beyond = Pose(np.eye(3), np.array([32_001.0, 0.0, 0.0]))
+    one.frames.pass_on(replace(frame_of(1, b"of one"), world_from_body=beyond))
+    assert one.handed == []
+    one.frames.pass_on(frame_of(1, b"of one"))
+    assert [peer for peer, _ in one.handed] == [2, 3]
+
+
 def test_a_frame_goes_to_everybody_who_did_not_take_it_and_once() -> None:
     one = Member(1)
     own, two_s = frame_of(1, b"of one"), frame_of(2, b"of two")

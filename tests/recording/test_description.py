@@ -97,3 +97,9 @@ def test_a_wrong_key_is_one_line(tmp_path: Path, text: str, says: str) -> None:
     assert message.startswith(f"{folder / 'recording.toml'}: ")
     assert says in message
     assert "\n" not in message
+
+
+def test_a_byte_order_mark_before_it_is_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "recording.toml"
+    path.write_bytes(b"\xef\xbb\xbfname = 'as Notepad saves it'\r\n")
+    assert read_description(path).name == "as Notepad saves it"

@@ -1,3 +1,4 @@
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -192,6 +193,20 @@ def test_a_setting_that_no_daemon_takes_leaves_a_finished_flight_as_it_is(
         fly(recording.path, out, FlyOptions(settings=(setting,)), lambda *_: None)
     assert says in str(raised.value)
     assert (out / "report.json").exists()
+
+
+@pytest.mark.parametrize("name", ["recording", "run/mine"])
+def test_a_recording_is_not_removed_to_make_room_for_its_flight(
+    recording: Recording, tmp_path: Path, name: str
+) -> None:
+    out = tmp_path / "out"
+    (out / name).parent.mkdir(parents=True)
+    shutil.copytree(recording.path, out / name)
+    (out / "run").mkdir(exist_ok=True)
+    (out / "run" / "flight.json").write_text("{}")
+    with pytest.raises(ConfigError, match="holds the recording to be flown"):
+        prepare_folder(out, plan_flight(read_recording(out / name), FlyOptions()))
+    assert (out / name / "recording.toml").exists()
 
 
 def test_the_output_folder_is_cleared_of_flights_and_of_nothing_else(

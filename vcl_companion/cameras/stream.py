@@ -45,8 +45,7 @@ from numpy.typing import NDArray
 from vcl_companion.cameras.source import Frame, Outcome
 from vcl_companion.clock import Clock, ManualClock
 from vcl_companion.errors import DeviceError, WireError
-
-MAX_IMAGE_BYTES = 16 * 1024 * 1024
+from vcl_companion.recording.images import MAX_IMAGE_BYTES
 
 _RECORD = struct.Struct("<4sBBHQQI")
 _ANSWER = struct.Struct("<4sBBHQ")

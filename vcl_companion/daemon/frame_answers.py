@@ -157,6 +157,10 @@ class FrameAnswers:
                 self._log.event("no answer", f"to drone {peer}: {error}")
                 _log.warning("no frame for drone %d: %s", peer, error)
                 continue
+            except Exception:
+                # A peer's map went in: it may not end the flight.
+                _log.exception("no frame for drone %d", peer)
+                continue
             if blob is None:
                 continue
             sent = self._hand(peer, blob)

@@ -230,17 +230,20 @@ class InterTarget:
             return "pose that comes too late to be fused"
         if asked is None or peer not in asked.waiting:
             return "pose nobody asked for"
-        sigma_m = math.inf
+        sigma_m, refusal = math.inf, None
         if isinstance(answer, PoseProposal):
             if answer.revision != asked.revision:
                 return "pose nobody asked for"
-            asked.proposals.append((peer, answer))
             sigma_m = _sigma_m(answer)
+            if sigma_m <= self._options.max_sigma_m:
+                asked.proposals.append((peer, answer))
+            else:
+                refusal = "pose vaguer than any is proposed"
         else:
             _log.debug("drone %d proposes no pose: %s", peer, answer.reason)
         self._hosts.answered(peer, sigma_m, asked.sigma_m, asked.frame.captured_at_ns)
         self._answered(asked, peer)
-        return None
+        return refusal
 
     def lost(self, peer: int) -> None:
         """Note that a peer will not answer: it is silent, or the request did not get there."""

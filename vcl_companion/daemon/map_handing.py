@@ -20,6 +20,7 @@ from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.transfer import BlobKind, Transfers
+from vcl_companion.wire.header import MAX_BLOB_BYTES
 from vcl_companion.wire.map_update import images_in_update, without_images
 
 # A transfer that has failed begins anew after this.
@@ -179,6 +180,8 @@ class MapHanding:
         if form is None:
             return
         kind, blob = form
+        if len(blob) > MAX_BLOB_BYTES:  # longer than the whole, of nothing but new images
+            kind, blob = BlobKind.MAP, stored.data
         sent_id = self._transfers.submit(peer, kind, blob, now_s)
         if last is not None and last.transfer_id != sent_id:
             self._transfers.cancel(last.transfer_id)  # the same map in another form

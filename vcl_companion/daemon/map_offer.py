@@ -11,6 +11,7 @@ from vcl_companion.daemon.shared_arrays import shared
 from vcl_companion.localization.map_index import MapIndex, index_map
 from vcl_companion.mapping.agreement import contradiction, have_common_keyframes, moved_to
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
+from vcl_companion.mapping.options import MOST_KEYFRAMES
 from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
 from vcl_companion.vision.features import Detector, FeatureOptions, Features
@@ -141,6 +142,9 @@ def ready_map(
     else:
         data = decode_map_update(offer.blob, parent, held)
     whole = decode(data)
+    if len(whole.keyframes) > MOST_KEYFRAMES:
+        # What is known of each of them is in every state, which frames wait for.
+        raise ValueError(f"a map of {len(whole.keyframes)} keyframes, at most {MOST_KEYFRAMES}")
 
     update = offer.update
     if current is not None and current.revision == offer.parent and not update:

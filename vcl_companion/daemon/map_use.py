@@ -113,7 +113,11 @@ class MapUse:
         while True:
             await self._maps.more_wanted()
             if self._falls_back:
-                await self._index_current()
+                try:
+                    await self._index_current()
+                except Exception:
+                    # Peers' images went in: none of them may end the flight.
+                    _log.exception("the map cannot be indexed further")
 
     async def _index_current(self) -> None:
         # Not in the loop above, which would keep a map that was left until the next is asked for.

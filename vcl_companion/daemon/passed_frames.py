@@ -144,7 +144,11 @@ class PassedFrames:
             elif state is not None and not state.revision:
                 continue  # it has no map that an update could be of: that comes first
             elif name not in there.held and name not in there.on_their_way.values():
-                blob = blob or encode_frame(replace(frame, seen=None), BlobKind.PASSED_FRAME)
+                try:
+                    blob = blob or encode_frame(replace(frame, seen=None), BlobKind.PASSED_FRAME)
+                except ValueError as error:  # where no pose can be told any more, say
+                    _log.warning("a frame of drone %d is not passed on: %s", frame.drone_id, error)
+                    return
                 there.on_their_way[self._hand(peer, blob)] = name
 
     def ended(self, peer: int, transfer_id: int, *, delivered: bool) -> None:

@@ -9,6 +9,9 @@ from vcl_companion.options import require_positive
 from vcl_companion.vision.av1_image import can_av1
 from vcl_companion.vision.features import Detector
 
+MOST_KEYFRAMES = 64
+"""Of any map that is flown on: what is known of each is in every state of the filter."""
+
 
 @dataclass(frozen=True)
 class MapOptions:
@@ -81,8 +84,10 @@ class MapOptions:
             raise ValueError(f"min_landmarks must be at least 20, got {self.min_landmarks}")
         if self.landmarks_per_cell < 1:
             raise ValueError(f"landmarks_per_cell must be positive, got {self.landmarks_per_cell}")
-        if not 4 <= self.max_keyframes <= 64:
-            raise ValueError(f"max_keyframes must lie in 4..64, got {self.max_keyframes}")
+        if not 4 <= self.max_keyframes <= MOST_KEYFRAMES:
+            raise ValueError(
+                f"max_keyframes must lie in 4..{MOST_KEYFRAMES}, got {self.max_keyframes}"
+            )
         if not self.min_landmarks <= self.max_landmarks <= 16_000:
             raise ValueError(
                 f"max_landmarks must lie in min_landmarks..16000, got {self.max_landmarks}"

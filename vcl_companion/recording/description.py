@@ -77,7 +77,7 @@ def read_description(path: Path) -> Description:
         RecordingError: it is not TOML, or a key is unknown or of the wrong type.
     """
     try:
-        table = tomllib.loads(path.read_text("utf-8"))
+        table = tomllib.loads(path.read_text("utf-8-sig"))
     except FileNotFoundError:
         return Description()
     except OSError as error:

@@ -21,6 +21,8 @@ _PNG_END = b"IEND"
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 # Some cameras pad behind the end marker; a file that was cut has none at all.
 _TAIL_BYTES = 1024
+MAX_IMAGE_BYTES = 16 * 1024 * 1024
+"""Of an encoded one: what is longer is no frame of a camera."""
 # EXIF must not turn the image: the calibration is of the sensor, not of the horizon.
 _GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -46,7 +48,8 @@ def image_size_px(path: Path) -> tuple[int, int]:
             file.seek(0)
             size = _size_px(file)
             file.seek(0, 2)
-            file.seek(max(0, file.tell() - _TAIL_BYTES))
+            n_bytes = file.tell()
+            file.seek(max(0, n_bytes - _TAIL_BYTES))
             whole = end in file.read()
     except FileNotFoundError:
         raise RecordingError(f"image {path} is missing; restore it or remove the row") from None
@@ -56,6 +59,8 @@ def image_size_px(path: Path) -> tuple[int, int]:
         raise RecordingError(f"image name {path.name[:80]!r} is not a file name") from None
     if size is None:
         raise RecordingError(f"image {path} is not a JPEG or PNG file")
+    if n_bytes > MAX_IMAGE_BYTES:
+        raise RecordingError(f"image {path} has more than {MAX_IMAGE_BYTES >> 20} MiB")
     if not whole:
         raise RecordingError(f"image {path} is cut off at its end; copy it again")
     return size
