@@ -339,6 +339,14 @@ def in_another_world() -> Callable[[Flight], None]:
     return join
 
 
+async def told_where_it_is(up: Flight, k: int) -> None:
+    """Wait for the k-th frame's answer: whatever its world, the autopilot's is the same."""
+    await up.server.answered()
+    pose = await up.autopilot.poses.get()
+    truth = demo.world_from_body(DRONE, k).translation
+    assert np.linalg.norm(np.array(pose[1:4]) - truth) < 0.1
+
+
 def test_what_was_looked_at_in_a_world_that_was_left_is_looked_at_again(tmp_path: Path) -> None:
     join = in_another_world()
 
@@ -356,10 +364,7 @@ def test_what_was_looked_at_in_a_world_that_was_left_is_looked_at_again(tmp_path
                     await until(lambda: executor._work_queue.qsize() == 1)
                     join(up)
                     looks.wait(20.0)
-                await up.server.answered()
-                pose = await up.autopilot.poses.get()
-                truth = demo.world_from_body(DRONE, k).translation
-                assert np.linalg.norm(np.array(pose[1:4]) - truth) < 0.1
+                await told_where_it_is(up, k)
             assert [outcome for _, outcome, _ in up.frames()] == ["localized"] * 6
 
     run(scenario())
@@ -399,10 +404,7 @@ def test_a_world_that_is_left_while_own_frames_are_looked_at_is_left(tmp_path: P
                     doubting.is_asked = lambda: None
                     join(up)
                     looks.wait(20.0)
-                await up.server.answered()
-                pose = await up.autopilot.poses.get()
-                truth = demo.world_from_body(DRONE, k).translation
-                assert np.linalg.norm(np.array(pose[1:4]) - truth) < 0.1
+                await told_where_it_is(up, k)
             assert [outcome for _, outcome, _ in up.frames()] == ["localized"] * 6
 
     run(scenario())
