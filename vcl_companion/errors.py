@@ -6,6 +6,11 @@ DISK_IS_FULL = frozenset((errno.ENOSPC, errno.EDQUOT))
 """Of an OSError: what was to be kept cannot be, and a restart in the air goes on without."""
 
 
+def reason_of(error: OSError | ValueError) -> str:
+    """Return what a file's error says to a person, without its number and the path."""
+    return getattr(error, "strerror", None) or str(error)
+
+
 class VclError(Exception):
     """A failure whose message is one line for a person: what, where, what to do."""
 

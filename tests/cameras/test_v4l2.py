@@ -75,6 +75,18 @@ def camera_of(capture: Callable[[], Capture], offset_s: float = 0.0) -> V4l2Came
     return V4l2Camera("film", capture, SIZE_PX, offset_s, SystemClock(), patience_s=0.1)
 
 
+async def two_frames(camera: V4l2Camera, may_read: threading.Semaphore, then: int) -> list[Frame]:
+    """Return a camera's frame of its first read, and that of so many more."""
+    frames = camera.frames()
+    may_read.release()
+    first = await anext(frames)
+    may_read.release(then)
+    second = await anext(frames)
+    may_read.release(100)
+    await camera.close()
+    return [first, second]
+
+
 async def levels_of(camera: V4l2Camera, n_frames: int) -> list[int]:
     """Return the grey levels of a camera's first frames."""
     out = []
@@ -122,16 +134,9 @@ def test_an_image_that_cannot_be_decoded_is_left_out() -> None:
                 return super().read()
 
         device = Paced([30, None, cv2.error("a buffer of no bytes"), 90])
-        camera = camera_of(lambda: device)
-        frames = camera.frames()
-        may_go_on.release()
-        first = await anext(frames)
-        may_go_on.release(3)
-        second = await anext(frames)
-        may_go_on.release(100)
-        await camera.close()
-        assert [first.sequence, second.sequence] == [0, 1]
-        return [int(frame.image[0, 0]) for frame in (first, second)]
+        frames = await two_frames(camera_of(lambda: device), may_go_on, then=3)
+        assert [frame.sequence for frame in frames] == [0, 1]
+        return [int(frame.image[0, 0]) for frame in frames]
 
     assert asyncio.run(scenario()) == [30, 90]
 
@@ -223,15 +228,8 @@ def test_a_step_back_of_the_device_s_clock_is_a_dropped_frame(tmp_path: Path) ->
     device = Device(video(tmp_path), (0.0, 1.0, 0.0, 0.0), may_read)
 
     async def scenario() -> list[int]:
-        camera = camera_of(lambda: device)
-        frames = camera.frames()
-        may_read.release()
-        first = await anext(frames)
-        may_read.release(2)
-        second = await anext(frames)
-        may_read.release(10)
-        await camera.close()
-        return [first.sequence, second.sequence]
+        frames = await two_frames(camera_of(lambda: device), may_read, then=2)
+        return [frame.sequence for frame in frames]
 
     assert asyncio.run(scenario()) == [0, 2]
 

@@ -33,7 +33,7 @@ from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.inter_target import Asked, InterTarget
-from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.odometry import Odometry
 from vcl_companion.daemon.own_fixes import OwnFixes
@@ -431,6 +431,19 @@ def test_what_was_searched_in_a_world_that_was_left_is_searched_again(tmp_path: 
     run(scenario())
 
 
+def asked_and_said(
+    stored: StoredMap, frame: Frame, refused: NotLocalized | None
+) -> tuple[AskedPeers, PoseProposal]:
+    """What drone 1 is asked of the first frame, and what it says of it."""
+    attitude = demo.shot(DRONE, 0).ned_from_body.rotation
+    asked = Asked(1, frame, attitude, stored.revision, np.inf, {1}, [])
+    there = demo.world_from_body(DRONE, 0)
+    return (
+        AskedPeers(asked, weakref.ref(stored), stored.world, np.zeros((1, 3)), refused),
+        PoseProposal.of(1, stored.revision, there, 1e-4 * np.eye(6)),
+    )
+
+
 def test_what_peers_said_is_not_told_when_its_world_is_left_meanwhile(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -446,13 +459,7 @@ def test_what_peers_said_is_not_told_when_its_world_is_left_meanwhile(
             up.give(0)
             frame = await coming
             up.outcomes.opened(frame)
-            shot, revision = demo.shot(DRONE, 0), stored.revision
-            asked = Asked(1, frame, shot.ned_from_body.rotation, revision, np.inf, {1}, [])
-            before = AskedPeers(
-                asked, weakref.ref(stored), stored.world, np.zeros((1, 3)), NotLocalized("fog")
-            )
-            there = demo.world_from_body(DRONE, 0)
-            said = PoseProposal.of(1, revision, there, 1e-4 * np.eye(6))
+            before, said = asked_and_said(stored, frame, NotLocalized("fog"))
 
             async def hear(asked_peers: AskedPeers) -> FilterState | None:
                 return up.peer_poses.fuse(1, said, asked_peers)
@@ -481,12 +488,7 @@ def test_what_peers_say_of_a_world_that_was_left_is_not_believed(tmp_path: Path)
             stored = up.maps.current
             assert stored is not None
             shot = demo.shot(DRONE, 0)
-            frame = Frame(shot.image, shot.at_ns, 0, 0)
-            revision = stored.revision
-            asked = Asked(1, frame, shot.ned_from_body.rotation, revision, np.inf, {1}, [])
-            before = AskedPeers(asked, weakref.ref(stored), stored.world, np.zeros((1, 3)), None)
-            there = demo.world_from_body(DRONE, 0)
-            said = PoseProposal.of(1, revision, there, 1e-4 * np.eye(6))
+            before, said = asked_and_said(stored, Frame(shot.image, shot.at_ns, 0, 0), None)
             join(up)
             assert up.peer_poses.fuse(1, said, before) is None
             assert up.estimator.sigma_m == np.inf

@@ -16,7 +16,7 @@ import numpy as np
 
 from vcl_companion.cameras.source import Outcome
 from vcl_companion.clock import Clock
-from vcl_companion.errors import DISK_IS_FULL, ConfigError
+from vcl_companion.errors import DISK_IS_FULL, ConfigError, reason_of
 from vcl_companion.geometry.pose import Pose, euler_pose_covariance
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.fix import Recognised
@@ -64,7 +64,7 @@ class FlightLog:
                 _keep_earlier(path)
                 self._file = open(path, "a", encoding="utf-8", buffering=1)  # noqa: SIM115 kept open
             except (OSError, ValueError) as error:
-                why = getattr(error, "strerror", None) or error
+                why = reason_of(error)
                 if getattr(error, "errno", None) not in DISK_IS_FULL:
                     raise ConfigError(f"[log] flight_log {path!r}: {why}") from error
                 _log.error("no flight log is kept in %s: %s", path, why)

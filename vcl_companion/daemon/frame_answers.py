@@ -141,10 +141,11 @@ class FrameAnswers:
         """Whether who does not coordinate may ask for this frame now."""
         now_s = asyncio.get_running_loop().time()
         last_id, taken_at_s = self._of_others.get(peer, (None, -math.inf))
-        if request_id != last_id and now_s < taken_at_s + _OTHERS_EVERY_S:
+        if request_id == last_id:
+            return True
+        if now_s < taken_at_s + _OTHERS_EVERY_S:
             return False
-        if request_id != last_id:
-            self._of_others[peer] = request_id, now_s
+        self._of_others[peer] = request_id, now_s
         return True
 
     async def run(self) -> None:

@@ -14,7 +14,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vcl_companion.errors import DISK_IS_FULL, ConfigError
+from vcl_companion.daemon.whole_file import write_whole
+from vcl_companion.errors import DISK_IS_FULL, ConfigError, reason_of
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.mapping.templates import Templates
 from vcl_companion.wire.map_codec import REVISION_BYTES, revision_of
@@ -108,7 +109,7 @@ class MapStore:
                 with tempfile.TemporaryFile(dir=self._directory):
                     pass
             except (OSError, ValueError) as error:
-                why = getattr(error, "strerror", None) or error
+                why = reason_of(error)
                 if getattr(error, "errno", None) not in DISK_IS_FULL:
                     raise ConfigError(f"[map] directory {directory!r}: {why}") from error
                 _log.error("no map can be kept in %s: %s", directory, why)
@@ -194,7 +195,7 @@ class MapStore:
             return
         path = self._directory / f"{stored.revision.hex()}.vclmap"
         try:
-            _write_whole(path, stored.data)
+            write_whole(path, stored.data)
             self._written[path] = len(self._written)
             _remove_oldest(self._directory, self._kept_bytes, self._written)
         except OSError as error:
@@ -212,7 +213,7 @@ class MapStore:
             OSError: it cannot be written; what was there stays.
         """
         if self.saved_file is not None:
-            _write_whole(self.saved_file, stored.data)
+            write_whole(self.saved_file, stored.data)
 
     def saved(self) -> bytes:
         """Return the encoded map to begin with; nothing is known of its bytes. Any thread may.
@@ -262,28 +263,3 @@ def _remove_oldest(directory: Path, kept_bytes: int, written: Mapping[Path, int]
         n_bytes += status.st_size
         if n_bytes > kept_bytes and k > 0:
             file.unlink(missing_ok=True)
-
-
-def _write_whole(path: Path, data: bytes) -> None:
-    """Put a file on the disk, whole or not at all.
-
-    Raises:
-        OSError: that has failed.
-    """
-    partial = path.with_suffix(".partial")
-    try:
-        with open(partial, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except OSError:
-        with suppress(OSError):
-            partial.unlink()
-        raise
-    # Its name is not on the disk before that of its folder is.
-    descriptor = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
+from vcl_companion.daemon.whole_file import write_whole
 from vcl_companion.errors import ConfigError
 
 
@@ -21,12 +21,7 @@ def write_before(path: Path, before: Mapping[str, float]) -> None:
     try:
         kept = read_before(path) if path.exists() else {}
         path.parent.mkdir(parents=True, exist_ok=True)
-        fresh = path.with_name(f".{path.name}.new")
-        with open(fresh, "w", encoding="utf-8") as file:
-            file.write(json.dumps({**before, **kept}, indent=1) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(fresh, path)
+        write_whole(path, json.dumps({**before, **kept}, indent=1).encode() + b"\n")
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}: nothing is changed") from error
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from vcl_companion.errors import ConfigError
+from vcl_companion.errors import ConfigError, reason_of
 
 # Older than this, whoever wrote it hangs or is gone; it is written every second.
 STALE_S = 5.0
@@ -112,7 +112,7 @@ def read_status(path: Path) -> ServiceStatus:
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: is not there; is the service running?") from error
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+        raise ConfigError(f"{path}: {reason_of(error)}") from error
     try:
         return msgspec.json.decode(data, type=ServiceStatus)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:

@@ -18,6 +18,7 @@ from vcl_companion.daemon.status import (
     ServiceStatus,
     write_status,
 )
+from vcl_companion.errors import reason_of
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.swarm.group import Group
 
@@ -70,7 +71,7 @@ class StatusWriter:
                 is_told = False
             except (OSError, ValueError) as error:
                 if not is_told:
-                    why = getattr(error, "strerror", None) or error
+                    why = reason_of(error)
                     _log.warning("%s: %s: no status is written", self._path, why)
                 is_told = True
             await asyncio.sleep(_EVERY_S)

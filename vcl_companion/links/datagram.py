@@ -17,7 +17,7 @@ from vcl_companion.links.reconnect import (
     LinkLostError,
     OnBytes,
     Reconnecting,
-    addresses_of,
+    socket_at,
 )
 
 _MAX_DATAGRAM_BYTES = 65535
@@ -42,7 +42,7 @@ class DatagramTransport(Reconnecting):
     async def _open(self) -> socket.socket:
         """Return a bound or connected socket."""
 
-    def _is_silent(self, opened: socket.socket) -> None:
+    def _heard_nothing(self, opened: socket.socket) -> None:
         """React to nothing having come for a while."""
 
     def _accepts(self, sender: Address) -> bool:
@@ -68,7 +68,7 @@ class DatagramTransport(Reconnecting):
                         async with asyncio.timeout(_SILENT_S):
                             await self._readable(opened.fileno())
                     except TimeoutError:
-                        self._is_silent(opened)
+                        self._heard_nothing(opened)
                     else:
                         self._receive_burst(opened, on_bytes)
             finally:
@@ -137,7 +137,7 @@ class UdpClient(DatagramTransport):
         self._port = port
 
     async def _open(self) -> socket.socket:
-        return await _first_address(self._host, self._port, socket.socket.connect)
+        return await socket_at(self._host, self._port, socket.SOCK_DGRAM, _connect)
 
     def write(self, data: bytes) -> None:
         """Send one frame as one datagram."""
@@ -174,7 +174,7 @@ class UdpListener(DatagramTransport):
         self._peer_heard_at_s = 0.0
 
     async def _open(self) -> socket.socket:
-        return await _first_address(self._host, self._port, socket.socket.bind)
+        return await socket_at(self._host, self._port, socket.SOCK_DGRAM, _bind)
 
     def write(self, data: bytes) -> None:
         """Send one frame to the peer, if there is one."""
@@ -250,38 +250,28 @@ class PeerSocket(DatagramTransport):
 
     def _join(self, opened: socket.socket, group: str) -> None:
         interface = socket.inet_aton(self._listen[0])
-        membership = socket.inet_aton(group) + interface
-        opened.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+        opened.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, self._membership(group))
         opened.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, interface)
 
-    def _is_silent(self, opened: socket.socket) -> None:
+    def _membership(self, group: str) -> bytes:
+        return socket.inet_aton(group) + socket.inet_aton(self._listen[0])
+
+    def _heard_nothing(self, opened: socket.socket) -> None:
         # Not even our own is heard: a network interface that went and came back is in no group.
         for group in self._groups():
             with contextlib.suppress(OSError):
-                membership = socket.inet_aton(group) + socket.inet_aton(self._listen[0])
-                opened.setsockopt(socket.IPPROTO_IP, socket.IP_DROP_MEMBERSHIP, membership)
+                leaving = socket.IP_DROP_MEMBERSHIP
+                opened.setsockopt(socket.IPPROTO_IP, leaving, self._membership(group))
             with contextlib.suppress(OSError):  # it is not back yet
                 self._join(opened, group)
 
 
-async def _first_address(
-    host: str, port: int, use: Callable[[socket.socket, Any], None]
-) -> socket.socket:
-    """Return a UDP socket that is bound or connected to an address of a name.
+async def _connect(opened: socket.socket, address: Any) -> None:
+    opened.connect(address)
 
-    Of IPv4 where it has one: ``localhost`` is both, and most that speak MAVLink know the one only.
-    """
-    failure: OSError | None = None
-    for family, kind, protocol, _, address in await addresses_of(host, port, socket.SOCK_DGRAM):
-        opened = socket.socket(family, kind, protocol)
-        try:
-            with _closed_on_error(opened):
-                use(opened, address)
-        except OSError as error:
-            failure = failure or error
-        else:
-            return opened
-    raise failure or OSError(f"{host} has no address")
+
+async def _bind(opened: socket.socket, address: Any) -> None:
+    opened.bind(address)
 
 
 @contextlib.contextmanager

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import socket
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,15 +21,35 @@ OnBytes = Callable[[bytes, Address | None], bool]
 """Takes what arrived, and from where if it was a datagram; says whether any was accepted."""
 
 
-async def addresses_of(host: str, port: int, kind: socket.SocketKind) -> list[Any]:
-    """Return what ``getaddrinfo`` says of a host, IPv4 first.
+async def socket_at(
+    host: str,
+    port: int,
+    kind: socket.SocketKind,
+    use: Callable[[socket.socket, Any], Awaitable[None]],
+) -> socket.socket:
+    """Return a socket that is bound or connected to the first address of a host that takes it.
+
+    Of IPv4 where it has one: ``localhost`` is both, and most that speak MAVLink know the one only.
 
     Raises:
-        OSError: it is not known.
+        OSError: it is not known, or none of its addresses takes it: why the first does not.
         ValueError: no host has such a name.
     """
     found = await asyncio.get_running_loop().getaddrinfo(host, port, type=kind)
-    return sorted(found, key=lambda one: one[0] != socket.AF_INET)
+    failure: OSError | None = None
+    for family, _, protocol, _, address in sorted(found, key=lambda f: f[0] != socket.AF_INET):
+        opened = socket.socket(family, kind, protocol)
+        try:
+            await use(opened, address)
+        except OSError as error:
+            opened.close()
+            failure = failure or error
+        except BaseException:
+            opened.close()
+            raise
+        else:
+            return opened
+    raise failure or OSError(f"{host} has no address")
 
 
 class LinkLostError(Exception):

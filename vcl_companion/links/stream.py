@@ -10,7 +10,7 @@ import termios
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import serial
 
@@ -20,7 +20,7 @@ from vcl_companion.links.reconnect import (
     LinkLostError,
     OnBytes,
     Reconnecting,
-    addresses_of,
+    socket_at,
 )
 
 _CONNECT_TIMEOUT_S = 5.0
@@ -145,27 +145,16 @@ class TcpTransport(StreamTransport):
         self._port = port
 
     async def _open(self) -> _Device:
-        loop = asyncio.get_running_loop()
         async with asyncio.timeout(_CONNECT_TIMEOUT_S):
-            failure: OSError | None = None
-            found = await addresses_of(self._host, self._port, socket.SOCK_STREAM)
-            for family, kind, protocol, _, address in found:
-                connection = socket.socket(family, kind, protocol)
-                try:
-                    connection.setblocking(False)
-                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 3)
-                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
-                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
-                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 5000)
-                    await loop.sock_connect(connection, address)
-                except OSError as error:
-                    connection.close()
-                    failure = failure or error
-                except BaseException:
-                    connection.close()
-                    raise
-                else:
-                    return connection
-            raise failure or OSError(f"{self._host} has no address")
+            return await socket_at(self._host, self._port, socket.SOCK_STREAM, _connect)
+
+
+async def _connect(connection: socket.socket, address: Any) -> None:
+    connection.setblocking(False)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 3)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 5000)
+    await asyncio.get_running_loop().sock_connect(connection, address)

@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vcl_companion.errors import ConfigError
+from vcl_companion.errors import ConfigError, reason_of
 from vcl_companion.links.signing import Stream
 
 _log = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ class TimestampFile:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except (OSError, ValueError) as error:
-            raise ConfigError(f"{path}: {_why(error)}") from error
+            raise ConfigError(f"{path}: {reason_of(error)}") from error
 
     def read(self) -> Timestamps:
         """Return what the last run has left; nothing, and a line in the log, of a broken file.
@@ -73,7 +73,7 @@ class TimestampFile:
         except FileNotFoundError:
             return Timestamps()
         except (OSError, ValueError) as error:
-            raise ConfigError(f"{self._path}: {_why(error)}") from error
+            raise ConfigError(f"{self._path}: {reason_of(error)}") from error
         try:
             return _decode(data)
         except (ValueError, TypeError, KeyError, RecursionError):
@@ -93,7 +93,7 @@ class TimestampFile:
             except OSError as error:
                 with suppress(OSError):
                     partial.unlink()
-                return _why(error)
+                return reason_of(error)
             return ""
 
 
@@ -121,7 +121,3 @@ def _below(value: object, end: int) -> int:
     if type(value) is not int or not 0 <= value < end:
         raise ValueError("no such number")
     return value
-
-
-def _why(error: OSError | ValueError) -> str:
-    return (error.strerror if isinstance(error, OSError) else None) or str(error)

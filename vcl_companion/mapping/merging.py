@@ -29,6 +29,7 @@ from vcl_companion.mapping.landmark_map import MAX_JOINED, JoinedMap, Keyframe, 
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.patch_table import PyramidOf, decoded_pyramid
 from vcl_companion.mapping.reconstruction import accepted
+from vcl_companion.mapping.registration import MIN_SEEN
 from vcl_companion.mapping.thinning import spread
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
@@ -47,8 +48,6 @@ _TURNS = ((8.0, 8), (3.0, 8), (1.0, 12))
 _LIMIT_PX, _MAX_SIGMAS = 0.5, 4.0
 # A map made with the same options has no more keyframes than they allow; work is bounded by it.
 _MOST_KEYFRAMES = 2
-# A keyframe that is brought along has to see this many landmarks in the end.
-_MIN_SEEN = 20
 # A merged map's worlds lie no further apart, nor differ more in scale: the wire has bounds.
 _FARTHEST_M, _MOST_SCALE = 30_000.0, 5.0
 
@@ -283,7 +282,7 @@ def _tied(seen: Mask, n_old: int) -> Index:
     Raises:
         ValueError: no other does.
     """
-    enough = seen.sum(axis=0) >= _MIN_SEEN
+    enough = seen.sum(axis=0) >= MIN_SEEN
     enough[:n_old] = True
     if not enough[n_old:].any():
         raise ValueError("adjusted together with this map, no keyframe of the other one fits")

@@ -29,7 +29,7 @@ _TRIED = 6
 # Of these so many, of most matches, are tried by themselves.
 _PAIRED = 2
 MIN_SEEN = 20
-"""A new view has to see this many landmarks in the end."""
+"""A view that joins, or a keyframe that is brought along, has to see as many in the end."""
 
 
 class Registration:

@@ -6,6 +6,7 @@ import struct
 from dataclasses import dataclass
 
 from vcl_companion.errors import WireError
+from vcl_companion.mapping.landmark_map import NAME_BYTES, NO_NAME
 from vcl_companion.vision.signature import SIGNATURE_BYTES
 from vcl_companion.wire.map_codec import MAX_LANDMARKS, REVISION_BYTES
 from vcl_companion.wire.reader import Reader
@@ -15,8 +16,6 @@ MAX_REASON_BYTES = 90
 MAX_TRACKED = (1 << 16) - 1
 MAX_TEAM = (1 << 8) - 1
 MAX_EPOCH = (1 << 32) - 1
-WORLD_BYTES = 8
-_NO_WORLD = bytes(WORLD_BYTES)
 
 # FrameRequest body
 # | 0  | u32 | request id                                             |
@@ -104,8 +103,8 @@ class MapState:
             raise ValueError(f"a team has 8 bits: {self.team}")
         if not 0 <= self.epoch <= MAX_EPOCH:
             raise ValueError(f"an epoch has 32 bits: {self.epoch}")
-        if len(self.world) not in (0, WORLD_BYTES) or self.world == _NO_WORLD:
-            raise ValueError(f"a world has 0 or {WORLD_BYTES} bytes, not all 0: {self.world!r}")
+        if len(self.world) not in (0, NAME_BYTES) or self.world == NO_NAME:
+            raise ValueError(f"a world has 0 or {NAME_BYTES} bytes, not all 0: {self.world!r}")
         if len(self.signature) > SIGNATURE_BYTES:
             raise ValueError(
                 f"a signature of {len(self.signature)} bytes, at most {SIGNATURE_BYTES}"
@@ -170,7 +169,7 @@ def encode_map_state(message: MapState) -> bytes:
         message.tracked,
         message.team,
         message.epoch,
-        message.world or _NO_WORLD,
+        message.world or NO_NAME,
         len(message.signature),
     )
     return head + message.signature
@@ -197,7 +196,7 @@ def decode_map_state(body: bytes) -> MapState:
             bool(wants),
             team,
             epoch,
-            b"" if world == _NO_WORLD else world,
+            b"" if world == NO_NAME else world,
             signature,
         )
     except ValueError as error:
