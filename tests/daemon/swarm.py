@@ -107,6 +107,7 @@ class Drone:
         self.log = FlightLog(str(log_path), clock)
         self.maps = MapStore(directory)
         self.requests: list[FrameRequest] = []
+        self._last_seen = 0
         self.estimator = Estimator(
             FilterOptions(), LocalizationOptions(), lambda why: self.log.event("jump", why),
             heading=heading,
@@ -159,7 +160,7 @@ class Drone:
     def track(self, n_landmarks: int, at: Pose | None = None) -> None:
         """Have the drone look at a frame with so many landmarks in it, without one at 0.
 
-        Where it was is by their patches then, if it is given, else nobody would want to know.
+        Where it was is by their patches then, if it is given, else where it took what it has seen.
         """
         at_ns = self.clock.now_ns()
         self._looked()
@@ -167,8 +168,9 @@ class Drone:
         if n_landmarks == 0:
             self.estimator.take_nothing(predicted, at_ns, None)
             return
+        there = demo.world_from_body(self.system_id, self._last_seen)
         fix = Localized(
-            at or Pose.identity(), 1e-4 * np.eye(6), 1e-4 * np.eye(6), np.zeros((6, 0)),
+            at or there, 1e-4 * np.eye(6), 1e-4 * np.eye(6), np.zeros((6, 0)),
             np.zeros((0, 0)), n_landmarks, n_landmarks, False, 0.5,
             n_seen=n_landmarks, covered=1.0, by="patches" if at else "features",
         )  # fmt: skip
@@ -177,6 +179,7 @@ class Drone:
     async def see(self, frame: Frame) -> None:
         """Have the drone take a frame, when its autopilot has measured at that instant."""
         self._looked()
+        self._last_seen = frame.sequence
         self.clock.advance_to(frame.captured_at_ns)
         taken = demo.shot(self.system_id).ned_from_body
         self.autopilot.measure(frame.captured_at_ns, taken.quaternion())

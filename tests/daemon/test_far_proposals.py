@@ -56,6 +56,23 @@ def test_nobody_is_taken_for_faster_than_he_flies(silent_s: float) -> None:
     assert abs(near.world_from_body.translation[0] - 0.2 * reach_m) < 0.1
 
 
+def test_no_peer_knows_better_where_we_are_than_our_own_frames_have_shown() -> None:
+    """Or our next frames would count for nothing beside what it has said."""
+    estimator, at_ns = after_a_fix(20.0)
+    points = demo.map_index(1, 2).landmark_map.points_world
+    there = Pose(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    oversure = np.diag([1e-4] * 3 + [1e-5] * 3) ** 2
+    fused = estimator.take_proposal(at_ns, None, there, oversure, points)
+    assert isinstance(fused, FilterState)
+    sigmas = np.sqrt(np.diag(fused.pose_covariance()))
+    assert (sigmas >= 0.99 * np.sqrt(np.diag(SURE))).all()
+    # What is no surer is taken as it is, however its errors hang together.
+    mixed = SURE.copy()
+    mixed[0, 4] = mixed[4, 0] = 0.9 * 0.04 * 0.004
+    mixed[0, 0], mixed[4, 4] = 0.04**2 * 6, 0.004**2 * 6
+    np.testing.assert_array_equal(estimator.last_own_fix.no_surer(4.0 * mixed), 4.0 * mixed)
+
+
 def test_what_comes_too_late_contradicts_nothing() -> None:
     estimator, at_ns = after_a_fix(1.0)
     late = proposed(estimator, at_ns - 500_000_000, 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -182,7 +183,42 @@ def test_a_revision_of_ours_that_shows_nothing_of_ours_is_refused(tmp_path: Path
             stranger.hand(BlobKind.MAP, encode_map(replace(disguised, keyframes=keyframes)), 2)
             await refused_as(drone, CONTRADICTS)
             assert drone.revision == revision_of(PAIR)
-            assert "it has none of its keyframes" in drone.events("refused")[0]
+            assert "it has 0 of its 2 keyframes" in drone.events("refused")[0]
+
+    run(scenario())
+
+
+@pytest.mark.parametrize("shift_m", [0.0, 3.0])
+def test_a_map_that_names_nothing_of_ours_is_held_against_our_frames(
+    tmp_path: Path, shift_m: float
+) -> None:
+    """As one of some revisions later may: an honest one is taken, for all that is new in it."""
+
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            drone = await members.start(2, (1, 2))
+            stranger = await members.stranger(1)
+            await stranger.meets(2)
+            async with flying(drone) as two:
+                for k in range(4):
+                    two.give(k)
+                    await two.server.answered()
+                later = bent(decode_map(NEXT), shift_m=(shift_m, 0.0, 0.0))
+                keyframes = tuple(
+                    replace(k, captured_at_ns=k.captured_at_ns + 1) for k in later.keyframes
+                )
+                world = revision_of(PAIR)
+                map_ = encode_map(
+                    replace(later, keyframes=keyframes, parent=b"unknown ", world=world)
+                )
+                stranger.hand(BlobKind.MAP, map_, 2)
+                if shift_m:
+                    await refused_as(drone, CONTRADICTS)
+                    (reason,) = drone.events("refused")
+                    assert re.search("a frame of ours was taken (2.9|3.0). m off by it$", reason)
+                    assert drone.revision == revision_of(PAIR)
+                else:
+                    await until(lambda: drone.revision == revision_of(map_))
 
     run(scenario())
 

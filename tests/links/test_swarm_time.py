@@ -81,6 +81,18 @@ def test_nobody_is_followed_into_the_far_future() -> None:
     assert time.told(7, NOON + 10 * YEAR, clocks.now()) is not None
 
 
+def test_nor_in_several_steps_but_as_far_ahead_of_a_clock_that_is_set() -> None:
+    clocks = Clocks()
+    time = SwarmTime(0, clocks.now(), TimeOptions(followed_s=10 * 365.25 * 86400.0))
+    for number, years in ((7, 6), (8, 12)):
+        assert time.asks(number, clocks.pass_s(10.0))
+        said = time.told(number, NOON + years * YEAR, clocks.now())
+        assert (said is None) == (years > 10)
+    clocks.wall_s += 5 * 31_557_600.0  # a time server is found
+    assert time.told(8, NOON + 12 * YEAR, clocks.now()) is not None
+    assert time.at(clocks.now()) == NOON + 12 * YEAR
+
+
 def test_a_member_is_not_answered_more_often_than_it_needs() -> None:
     clocks = Clocks()
     time = SwarmTime(0, clocks.now())

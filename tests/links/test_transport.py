@@ -225,7 +225,9 @@ def test_udp_to_nobody_is_counted_and_heard_when_somebody_comes() -> None:
     assert tally.snapshot().refused["nobody listens at the other side"] >= 1
 
 
-def test_a_listener_adopts_the_first_who_makes_sense() -> None:
+@pytest.mark.parametrize("host", ["127.0.0.1", "[::]"])
+def test_a_listener_adopts_the_first_who_makes_sense(host: str) -> None:
+    """Also where it hears IPv4 on a socket of both families, and is told its network."""
     tally = LinkTally()
     inbox = Inbox(accepts=False)
 
@@ -233,7 +235,7 @@ def test_a_listener_adopts_the_first_who_makes_sense() -> None:
         async with udp() as free:
             port = free.port
         listener = open_transport(
-            f"udpin:127.0.0.1:{port}", tally, allowed_senders=["127.0.0.0/8"], backoff=QUICK
+            f"udpin:{host}:{port}", tally, allowed_senders=["127.0.0.0/8"], backoff=QUICK
         )
         async with running(listener.run(inbox.on_bytes, inbox.on_connected)):
             await inbox.connected()

@@ -73,6 +73,9 @@ class Two:
         return aligned(one, other, common, options, 0, one_world=False)
 
 
+OURS = b"ours    "
+
+
 def two(
     seed: int,
     others: tuple[Pose, ...] = OTHERS,
@@ -459,6 +462,36 @@ def test_what_was_joined_before_is_told_in_the_worlds_that_are_now() -> None:
     assert last.world == b"theirs  "
     composed = last.world_from_other @ of_before
     np.testing.assert_allclose(composed.difference(before.world_from_other), 0.0, atol=1e-9)
+
+
+def test_where_the_worlds_are_that_ours_knows_is_not_for_the_other_map_to_say() -> None:
+    given = two(15, errors_m=(0.0, 0.0))
+    wrong = Similarity(NORTH, np.array([50.0, 0.0, 0.0]), 2.0)
+    known = Similarity(NORTH, np.array([1.0, 2.0, 3.0]), 1.02)
+    junior = replace(
+        given.junior,
+        parent=b"someone ",
+        world=b"theirs  ",
+        joined=(JoinedMap(b"later   ", b"known   ", wrong), JoinedMap(b"of ours ", OURS, wrong)),
+    )
+    senior = replace(
+        given.senior,
+        parent=b"parent  ",
+        world=OURS,
+        joined=(JoinedMap(b"earlier ", b"known   ", known),),
+    )
+    found = replace(given, senior=senior, junior=junior).merged()
+    assert isinstance(found, LandmarkMap), found
+    assert [j.revision for j in found.joined] == [
+        b"earlier ",
+        b"later   ",
+        b"of ours ",
+        b"junior  ",
+    ]
+    for world, place in ((b"known   ", known), (OURS, Similarity.identity())):
+        joined = found.joined_with(world)
+        assert joined is not None
+        np.testing.assert_allclose(joined.world_from_other.difference(place), 0.0, atol=1e-9)
 
 
 def test_the_number_of_keyframes_is_bounded_and_the_newest_stay() -> None:

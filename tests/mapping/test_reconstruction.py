@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from tests.checks import assert_consistent, assert_pose_close
-from tests.mapping.views import LEADER_ATTITUDE, descriptors_of, drone_views, world_from_scene
+from tests.mapping.views import (
+    LEADER_ATTITUDE,
+    descriptors_of,
+    drone_views,
+    map_of,
+    world_from_scene,
+)
 from tests.scenes import (
     PINHOLE,
     RADIAL_TANGENTIAL,
@@ -23,7 +29,7 @@ from vcl_companion.geometry.relative_attitude import RelativeAttitude
 from vcl_companion.geometry.rotation import Array, about_down, exp_so3
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.landmark_map import LandmarkMap
-from vcl_companion.mapping.reconstruction import MapOptions, NoMap, reconstruct
+from vcl_companion.mapping.reconstruction import MapOptions, NoMap, accepted, reconstruct
 from vcl_companion.mapping.uncertainty import map_uncertainty
 from vcl_companion.mapping.visibility import choose_hypothesis
 from vcl_companion.vision.essential import RelativePose
@@ -454,6 +460,31 @@ def test_a_baseline_too_short_for_any_depth_is_refused() -> None:
     views = drone_views(rng, scene, [1, 2], attitude_sigma_rad=0.02)
     reason = refusal(views, 1, [(1, 2, scene.baseline_m(0, 1))])
     assert any(text in reason for text in ("too close together", "could be placed")), reason
+
+
+@pytest.mark.parametrize("north_m", [0.0, 1000.0])
+def test_how_vague_a_map_is_has_nothing_to_do_with_where_its_world_begins(north_m: float) -> None:
+    """Far out all would pass, and none where little is known of where the world begins by now."""
+    made = map_of(facade_scene(np.random.default_rng(15), 300, n_views=3, noise_px=0.5), 0.01)
+    off = np.array([north_m, 0.0, 0.0])
+    made = replace(
+        made,
+        keyframes=tuple(
+            replace(
+                k,
+                world_from_body=Pose(
+                    k.world_from_body.rotation, k.world_from_body.translation + off
+                ),
+            )
+            for k in made.keyframes
+        ),
+        points_world=made.points_world + off,
+        anchor_covariance=np.diag([3.0] * 3 + [1e-4] * 3) ** 2,
+    )
+    assert isinstance(accepted(made, MapOptions()), LandmarkMap)
+    refused = accepted(made, MapOptions(max_depth_error=1e-3))
+    assert isinstance(refused, NoMap)
+    assert "too close together" in refused.reason
 
 
 def test_drones_in_the_same_place_are_refused() -> None:

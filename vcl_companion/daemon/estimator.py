@@ -326,6 +326,7 @@ class Estimator:
         too_far = self.last_own_fix.too_far(at_ns, world_from_body, covariance)
         if too_far:
             return NotFused(too_far, contradicts=True)
+        covariance = self.last_own_fix.no_surer(covariance)
         if self._history.newest is None:
             state = started_from_proposal(
                 world_from_body, covariance, at_ns, ned_from_body, self._options

@@ -31,7 +31,9 @@ from vcl_companion.daemon.inter_target import InterTarget
 from vcl_companion.daemon.map_rounds import MapRounds, RoundOptions
 from vcl_companion.daemon.map_sharing import MapSharing
 from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.map_trial import MapTrial
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.mishaps import survived
 from vcl_companion.daemon.outbox import Outbox
 from vcl_companion.daemon.own_state import OwnState
 from vcl_companion.daemon.passed_frames import PassedFrames
@@ -173,6 +175,7 @@ class Exchange:
             self._passed,
             options.update.delivery_wait_s,
             len(options.detectors) > 1,
+            MapTrial(self.frames, maps, estimator, work),
             estimator.carry,
             lambda: self._rounds.is_under_way,
         )
@@ -306,11 +309,14 @@ class Exchange:
             # In a small swarm at every turn: these are a look apart, or there is news.
             if now_s >= looked_at_s + look_s(self._group.stretch - 1.0):
                 looked_at_s = now_s
-                self._presence.poll(now_s)
-            self.trust.poll()
-            self._own_state.poll(now_s)
-            self._sharing.handing.hand_out(now_s)
-            self._deliveries.take(self._outbox.poll())
+                with survived("looking after peers"):
+                    self._presence.poll(now_s)
+            with survived("dealing with peers"):
+                self.trust.poll()
+                self._own_state.poll(now_s)
+                self._sharing.handing.hand_out(now_s)
+            with survived("taking what peers have sent"):
+                self._deliveries.take(self._outbox.poll())
             await self._outbox.pause(now_s)
 
     def want_update(self, wanted: bool) -> None:

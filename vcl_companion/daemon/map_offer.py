@@ -9,9 +9,9 @@ from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.shared_arrays import shared
 from vcl_companion.localization.map_index import MapIndex, index_map
-from vcl_companion.mapping.agreement import contradiction, have_common_keyframes, moved_to
+from vcl_companion.mapping.agreement import broken_descent, contradiction, moved_to
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
-from vcl_companion.mapping.options import MOST_KEYFRAMES
+from vcl_companion.mapping.options import MOST_KEYFRAMES, MOST_PIXELS
 from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
 from vcl_companion.vision.features import Detector, FeatureOptions, Features
@@ -145,6 +145,8 @@ def ready_map(
     if len(whole.keyframes) > MOST_KEYFRAMES:
         # What is known of each of them is in every state, which frames wait for.
         raise ValueError(f"a map of {len(whole.keyframes)} keyframes, at most {MOST_KEYFRAMES}")
+    if whole.n_pixels > MOST_PIXELS:
+        raise ValueError(f"a map of {whole.n_pixels} pixels, at most {MOST_PIXELS}")
 
     update = offer.update
     if current is not None and current.revision == offer.parent and not update:
@@ -175,9 +177,9 @@ def _contradiction(current: StoredMap, landmark_map: LandmarkMap, revision: byte
         joined = landmark_map.joined_with(current.world)
         if joined is not None:
             landmark_map = moved_to(landmark_map, joined.world_from_other.inverse())
-    if landmark_map.parent == current.revision and not have_common_keyframes(own, landmark_map):
-        return "made from ours, it has none of its keyframes"
-    return contradiction(own, current.index.uncertainty, landmark_map)
+    is_child = landmark_map.parent == current.revision
+    broken = broken_descent(own, landmark_map) if is_child else ""
+    return broken or contradiction(own, current.index.uncertainty, landmark_map)
 
 
 def with_fallbacks(

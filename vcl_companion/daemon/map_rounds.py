@@ -25,6 +25,7 @@ from vcl_companion.daemon.gathering import Gathering, Wanted
 from vcl_companion.daemon.map_extension import Decide, MapExtension
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.mishaps import survived
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.daemon.peer_clocks import PeerClocks
 from vcl_companion.daemon.round_building import RoundBuilding
@@ -46,6 +47,8 @@ _log = logging.getLogger(__name__)
 _GATHERING, _BUILDING, _NO_UPDATE = 20, 60, 255
 # A camera that delivers nothing new has nothing for a map either.
 _STALE_NS = 60 * 1_000_000_000
+# What has failed for a reason that nobody has foreseen may fail again at once.
+_AFTER_MISHAP_S = 1.0
 
 # Who has less than this share of our landmarks in sight looks elsewhere by now, or soon: its word
 # is a second old (more in a large swarm), and one that turns away fast needs its view in this
@@ -166,23 +169,27 @@ class MapRounds:
         """Make rounds until cancelled; each needs a frame that was not tried before."""
         began_at_s = self._now_s()
         while True:
-            self._trigger.poll(self._now_s())
-            stored, frame = self._maps.current, self._untried()
-            pause_s = look_s(self._group.stretch)
-            if frame is None:
-                await asyncio.sleep(pause_s)
-            elif stored is None and self._turn.is_due(began_at_s):
-                self._tried = frame
-                await self._first_map(frame)
-            elif stored is not None and self._is_due():
-                self._tried = frame
-                try:
-                    is_from_new_places = await self._next_revision(stored, frame)
-                finally:
-                    self.progress, self.is_asked = _NO_UPDATE, False
-                self._trigger.ended(self._now_s(), from_new_places=is_from_new_places)
-            else:
-                await asyncio.sleep(pause_s)
+            with survived("making maps"):
+                while True:
+                    await self._turn_of(began_at_s)
+            await asyncio.sleep(_AFTER_MISHAP_S)
+
+    async def _turn_of(self, began_at_s: float) -> None:
+        """Make a round if one is due; else wait a moment."""
+        self._trigger.poll(self._now_s())
+        stored, frame = self._maps.current, self._untried()
+        if frame is not None and stored is None and self._turn.is_due(began_at_s):
+            self._tried = frame
+            await self._first_map(frame)
+        elif frame is not None and stored is not None and self._is_due():
+            self._tried = frame
+            try:
+                is_from_new_places = await self._next_revision(stored, frame)
+            finally:
+                self.progress, self.is_asked = _NO_UPDATE, False
+            self._trigger.ended(self._now_s(), from_new_places=is_from_new_places)
+        else:
+            await asyncio.sleep(look_s(self._group.stretch))
 
     def _is_due(self) -> bool:
         if self._is_merging():

@@ -14,6 +14,7 @@ from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.mailbox import Mailbox
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.mishaps import fix_or_none
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.localization.pipeline import Effort
@@ -124,8 +125,10 @@ class MapSearch:
             began_s = asyncio.get_running_loop().time()
             predicted = self._estimator.predicted(frame.captured_at_ns, sought.ned_from_body)
             prior = predicted.prior() if predicted else None
-            fix = await self._work.find(
-                np.asarray(frame.image), stored, prior, sought.ned_from_body, effort
+            fix = await fix_or_none(
+                self._work.find(
+                    np.asarray(frame.image), stored, prior, sought.ned_from_body, effort
+                )
             )
             if not self._maps.has_left_world(stored.world):
                 if isinstance(fix, Localized):

@@ -10,6 +10,7 @@ import asyncio
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor
+from dataclasses import replace
 
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.mailbox import PeerMailbox
@@ -18,6 +19,7 @@ from vcl_companion.daemon.map_handing import MapHanding
 from vcl_companion.daemon.map_merging import MapMerging
 from vcl_companion.daemon.map_offer import MapOffer, ReadyMap
 from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.map_trial import MapTrial
 from vcl_companion.daemon.map_use import MapUse
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.own_maps import OwnMaps
@@ -54,6 +56,7 @@ class MapSharing:
         delivery_wait_s: how long a coordinator that is back with a map which we
             have left may take to be brought up to date; then it has its way.
         falls_back: whether maps are indexed by other detectors too, sooner or later.
+        trial: holds maps against what our own frames have shown.
         carry: takes what is believed of our pose to another map's world.
         is_updating: whether a round of ours is under way that updates the map.
 
@@ -77,6 +80,7 @@ class MapSharing:
         passed: PassedFrames,
         delivery_wait_s: float,
         falls_back: bool,
+        trial: MapTrial,
         carry: Callable[[Similarity], None],
         is_updating: Callable[[], bool],
     ) -> None:
@@ -89,6 +93,7 @@ class MapSharing:
         self._trust = trust
         self._delivery_wait_s = delivery_wait_s
         self._contradicting: deque[tuple[int, bytes]] = deque(maxlen=_N_CONTRADICTING)
+        self._trial = trial
         self._carry = carry
         self._branches = MapBranches(group, maps, self._is_receiving, delivery_wait_s)
         self._offered: PeerMailbox[MapOffer] = PeerMailbox()
@@ -138,6 +143,7 @@ class MapSharing:
         ready = await self._use.made_ready(offer)
         if isinstance(ready, NoMap):
             return "map", ready.reason
+        ready = await self._tried(ready, offer.revision)
         why_not = self._why_not(peer, offer)  # again: preparing took a while
         if why_not is not None:
             return why_not, ""
@@ -150,6 +156,17 @@ class MapSharing:
         self._join(peer, way)
         await self._use.fly_on(ready)
         return None
+
+    async def _tried(self, ready: ReadyMap, revision: bytes) -> ReadyMap:
+        """Try a map that does not contradict ours on what our own frames have shown."""
+        current = self._maps.current
+        if ready.contradicts or current is None:
+            return ready
+        way = way_into(current, ready.index.landmark_map, revision)
+        if isinstance(way, str):
+            return ready
+        into = None if way is None else way.world_from_other
+        return replace(ready, contradicts=await self._trial.contradiction(ready, into))
 
     def _may_merge(self, peer: int, offer: MapOffer) -> bool:
         return not self._trust.why_not(peer) and self._branches.is_to_merge(peer, offer)

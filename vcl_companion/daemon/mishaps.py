@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 from vcl_companion.errors import WireError
+from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.mapping.options import NoMap
 
 _log = logging.getLogger(__name__)
 
 _Made = TypeVar("_Made")
+# What has been said of errors that nobody has foreseen: with every frame it would fill the journal.
+_said: set[str] = set()
+_MOST_SAID = 64
 
 
 async def made_or_no_map(making: Awaitable[_Made], cannot: str, failed: str) -> _Made | NoMap:
@@ -32,3 +37,27 @@ async def made_or_no_map(making: Awaitable[_Made], cannot: str, failed: str) -> 
     except Exception as error:
         _log.exception(cannot)
         return NoMap(f"{failed}: {type(error).__name__}")
+
+
+async def fix_or_none(looking: Awaitable[Localized | NotLocalized]) -> Localized | NotLocalized:
+    """Wait for what a frame gives on a map that came from peers; an error is no fix.
+
+    The flight log tells it of each frame, the journal once of each kind.
+    """
+    try:
+        return await looking
+    except Exception as error:
+        reason = f"looking at it failed: {type(error).__name__}"
+        if reason not in _said and len(_said) < _MOST_SAID:
+            _said.add(reason)
+            _log.exception("a frame cannot be looked at")
+        return NotLocalized(reason)
+
+
+@contextmanager
+def survived(what: str) -> Iterator[None]:
+    """Say in the journal what has failed that nobody has foreseen, and go on."""
+    try:
+        yield
+    except Exception:
+        _log.exception("%s failed, and goes on", what)

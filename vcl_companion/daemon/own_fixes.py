@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -11,6 +12,7 @@ from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.map_store import MapStore, StoredMap
+from vcl_companion.daemon.mishaps import fix_or_none
 from vcl_companion.daemon.odometry import Odometry
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot import AutopilotLink
@@ -133,8 +135,7 @@ class OwnFixes:
         options = self._options.by_heading(self._estimator.has_heading)
         own: Localized | NotLocalized = NotLocalized("not looked for")
         for prior in predicted.priors_on_own_views():
-            own = await asyncio.get_running_loop().run_in_executor(
-                self._executor,
+            own = await self._looked(
                 follow_own_views,
                 frame.image,
                 self._sensor.camera,
@@ -175,8 +176,7 @@ class OwnFixes:
     ) -> Localized | NotLocalized:
         """Return what a frame gives from where the drone is believed to have been then."""
         predicted = self._estimator.predicted(frame.captured_at_ns, ned_from_body)
-        return await asyncio.get_running_loop().run_in_executor(
-            self._executor,
+        return await self._looked(
             localize,
             frame.image,
             self._sensor.camera,
@@ -188,6 +188,13 @@ class OwnFixes:
             self._options,
             replace(effort, has_heading=self._estimator.has_heading),
         )
+
+    async def _looked(
+        self, look: Callable[..., Localized | NotLocalized], *args: object
+    ) -> Localized | NotLocalized:
+        """Have a frame looked at beside the event loop."""
+        loop = asyncio.get_running_loop()
+        return await fix_or_none(loop.run_in_executor(self._executor, look, *args))
 
     def note(self, frame: Frame, look: Look) -> None:
         """Remember a frame whose fix was taken: we may have to go on by it."""

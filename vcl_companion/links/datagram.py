@@ -186,6 +186,8 @@ class UdpListener(DatagramTransport):
     def _accepts(self, sender: Address) -> bool:
         if self._allowed:
             host = ipaddress.ip_address(sender[0])
+            # A socket of both families hears who has an IPv4 address by one that holds it.
+            host = getattr(host, "ipv4_mapped", None) or host
             if not any(host in network for network in self._allowed):
                 return False
         silent_s = asyncio.get_running_loop().time() - self._peer_heard_at_s
@@ -284,6 +286,7 @@ def _closed_on_error(opened: socket.socket) -> Iterator[None]:
 
 
 def _bare(sender: tuple[object, ...]) -> Address:
+    """Return host, with the interface of a link-local one, and port."""
     host, port = str(sender[0]), sender[1]
     assert isinstance(port, int)
-    return host.partition("%")[0], port
+    return host, port

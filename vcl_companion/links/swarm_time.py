@@ -17,9 +17,10 @@ So the swarm's time is its own. It is the **latest** that any member knows, and 
 * One who is far behind must be able to ask, so a question is answered whatever its own
   timestamp. That gives nothing away: an answer to an old question is nobody's any more.
 
-A member is followed by ten years at most: a clock that is further ahead is broken, and does
-not take the swarm with it. One that has followed a wrong clock stays ahead; that does no
-harm, since its peers are there as well, and who joins is told.
+Members are followed to ten years ahead of what this drone knows itself at most, in one run: a
+clock that is further ahead is broken, and does not take the swarm with it. One that has
+followed a wrong clock stays ahead; that does no harm, since its peers are there as well, and
+who joins is told.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ class TimeOptions:
     """How the swarm's time is learned.
 
     Attributes:
-        followed_s: a member that is further ahead is not followed.
+        followed_s: a member that is further ahead of our own clock, or of the mark that we began
+            at, is not followed: not in several steps either.
         asked_s: how long an answer is waited for before the next question; it is how far
             behind a delayed answer can leave us.
         answered_s: a member is answered no more often than this.
@@ -57,6 +59,11 @@ def wall_ticks(wall_ns: int) -> int:
     return wall_ns // TICK_NS - _ZERO_S * TICKS_PER_S
 
 
+def _since(base: int, at_ns: int, now: Moment) -> int:
+    """Return what time it is now that it was ``base`` at an instant of the monotonic clock."""
+    return base + max(0, now.monotonic_ns - at_ns) // TICK_NS
+
+
 class SwarmTime:
     """What time it is in the swarm, in ticks of 10 us since 2015, GMT.
 
@@ -70,14 +77,17 @@ class SwarmTime:
         self._options = options or TimeOptions()
         self._base = min(max(earliest, EARLIEST), LATEST)
         self._base_at_ns = now.monotonic_ns
+        self._own, self._own_at_ns = self._base, now.monotonic_ns  # whatever others have said
         self._last = self._base
         self._asked: tuple[int, int] | None = None
         self._answered_at_ns: dict[int, int] = {}
 
     def at(self, now: Moment) -> int:
         """Return the time; it never falls."""
-        running = self._base + max(0, now.monotonic_ns - self._base_at_ns) // TICK_NS
+        running = _since(self._base, self._base_at_ns, now)
         wall = wall_ticks(now.wall_ns)
+        if _since(self._own, self._own_at_ns, now) < wall <= LATEST:
+            self._own, self._own_at_ns = wall, now.monotonic_ns
         if running < wall <= LATEST:
             self._base, self._base_at_ns = wall, now.monotonic_ns
             return wall
@@ -123,7 +133,9 @@ class SwarmTime:
         if self._since_s(self._asked[1], now) >= self._options.asked_s:
             return None
         ahead_s = (timestamp - self.at(now)) / TICKS_PER_S
-        if not 0.0 < ahead_s <= self._options.followed_s or timestamp > LATEST:
+        own = _since(self._own, self._own_at_ns, now)
+        is_followed = timestamp - own <= self._options.followed_s * TICKS_PER_S
+        if not (ahead_s > 0.0 and is_followed) or timestamp > LATEST:
             return None
         self._base, self._base_at_ns = timestamp, now.monotonic_ns
         return ahead_s

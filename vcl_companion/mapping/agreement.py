@@ -3,7 +3,9 @@
 Maps come from peers, and one that is wrong would take every drone that flies on it along.
 What both maps know, keyframes of the same drone and instant and the landmarks seen there,
 must be where it was, as far as the one in use knows that itself; what the other one says of
-its own accuracy does not count.
+its own accuracy does not count. Who made it has named what is compared, so that alone does not
+suffice: one made from ours must have much of ours, and what a frame of our own shows must be
+where it was (``moved_frame``).
 """
 
 from __future__ import annotations
@@ -13,8 +15,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.geometry.similarity import Similarity
+from vcl_companion.geometry.worst_sigma import worst_sigma
 from vcl_companion.mapping.known_features import Index
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.uncertainty import MapUncertainty
@@ -33,6 +37,10 @@ _MAX_MOVED = 0.3
 _CONTRADICTS = 5.0
 # So few landmarks in common tell nothing.
 _FEWEST = 20
+# A revision keeps at least such a share of the keyframes of the one that it was made from, and of
+# the landmarks that those see. Extended, it loses no more keyframes than are new: three of four
+# where it may have but four; merged, half of them. Of landmarks half stay at least, mostly all.
+_LEAST_KEPT = 0.25
 
 
 def contradiction(old: LandmarkMap, sure: MapUncertainty, new: LandmarkMap) -> str:
@@ -59,6 +67,37 @@ def contradiction(old: LandmarkMap, sure: MapUncertainty, new: LandmarkMap) -> s
     )
 
 
+def broken_descent(old: LandmarkMap, new: LandmarkMap) -> str:
+    """Say what a map lacks that says it was made from the one in use; empty if it has enough."""
+    places = _in_common(old, new)
+    if len(places) < _LEAST_KEPT * len(old.keyframes):
+        return f"made from ours, it has {len(places)} of its {len(old.keyframes)} keyframes"
+    n_before = int(old.seen[:, [before for before, _ in places]].any(axis=1).sum())
+    n_kept = len(_same_landmarks(old, new, places)[0])
+    if n_kept < _LEAST_KEPT * n_before:
+        return f"made from ours, it has {n_kept} of the {n_before} landmarks in its keyframes"
+    return ""
+
+
+def moved_frame(
+    known: Pose, covariance: Array, found: Pose, noise: Array, landmark_map: LandmarkMap
+) -> str:
+    """Say how a frame of ours contradicts a map that it was found on; empty if it does not.
+
+    Args:
+        known: where we were by the map in use, carried to the other one's world.
+        covariance: (6, 6) local, of that.
+        found: where we were by the other map.
+        noise: (6, 6) local, of the finding alone: what the map says of itself does not count.
+        landmark_map: the map in use.
+    """
+    reach_m = _MOST * _scene_m(landmark_map)
+    if worst_sigma(noise[:3, :3]) > reach_m:
+        return ""
+    metres = _moved(known, covariance + noise, found, reach_m)
+    return "" if metres is None else f"a frame of ours was taken {metres:.2f} m off by it"
+
+
 def moved_to(landmark_map: LandmarkMap, other_from_world: Similarity) -> LandmarkMap:
     """Return a map as it is in another world, to be compared with one of that."""
     return replace(
@@ -73,11 +112,6 @@ def moved_to(landmark_map: LandmarkMap, other_from_world: Similarity) -> Landmar
             for d in landmark_map.distances
         ),
     )
-
-
-def have_common_keyframes(old: LandmarkMap, new: LandmarkMap) -> bool:
-    """Whether two maps have a keyframe in common: of the same drone and instant."""
-    return bool(_in_common(old, new))
 
 
 def _in_common(old: LandmarkMap, new: LandmarkMap) -> list[tuple[int, int]]:
@@ -102,19 +136,30 @@ def _moved_keyframes(
     places: list[tuple[int, int]],
     reach_m: float,
 ) -> str:
-    floor = np.diag([_LEAST_M**2] * 3 + [_LEAST_RAD**2] * 3)
     moved_m = []
     for before, after in places:
         own = slice(6 * before, 6 * before + 6)
-        step = old.keyframes[before].world_from_body.local(new.keyframes[after].world_from_body)
-        covariance = sure.keyframe_covariance[own, own] + floor
-        squared = float(step @ np.linalg.solve(covariance, step))
-        metres = float(np.linalg.norm(step[:3]))
-        if squared > _CHI2_6 or metres > max(reach_m, _LEAST_M):
+        there = new.keyframes[after].world_from_body
+        metres = _moved(
+            old.keyframes[before].world_from_body,
+            sure.keyframe_covariance[own, own],
+            there,
+            reach_m,
+        )
+        if metres is not None:
             moved_m.append(metres)
     if len(moved_m) <= _MAX_MOVED * len(places):
         return ""
     return f"{len(moved_m)} of {len(places)} known keyframes moved by {np.median(moved_m):.2f} m"
+
+
+def _moved(known: Pose, covariance: Array, other: Pose, reach_m: float) -> float | None:
+    """Return by how much a pose has moved, m; None if not by more than may be."""
+    step = known.local(other)
+    floor = np.diag([_LEAST_M**2] * 3 + [_LEAST_RAD**2] * 3)
+    squared = float(step @ np.linalg.solve(covariance + floor, step))
+    metres = float(np.linalg.norm(step[:3]))
+    return metres if squared > _CHI2_6 or metres > max(reach_m, _LEAST_M) else None
 
 
 def _moved_distances(old: LandmarkMap, new: LandmarkMap, places: list[tuple[int, int]]) -> str:

@@ -12,7 +12,7 @@ from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.culling import Mask
 from vcl_companion.mapping.growth import Growth
 from vcl_companion.mapping.landmark_map import KnownDistance, LandmarkMap
-from vcl_companion.mapping.options import MapOptions
+from vcl_companion.mapping.options import MOST_PIXELS, MapOptions
 from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
 from vcl_companion.vision.information import squared_distances
 
@@ -72,7 +72,8 @@ def pruned(landmark_map: LandmarkMap, n_old: int, options: MapOptions) -> Landma
     while n_old > 0:
         keyframes = landmark_map.keyframes
         size = sum(len(k.image_bytes) for k in keyframes)
-        if len(keyframes) <= options.max_keyframes and size <= MAX_IMAGE_BYTES:
+        fits = size <= MAX_IMAGE_BYTES and landmark_map.n_pixels <= MOST_PIXELS
+        if len(keyframes) <= options.max_keyframes and fits:
             break
         seen = landmark_map.seen
         # A landmark that few others see is mostly this keyframe's own.

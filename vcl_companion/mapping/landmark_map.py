@@ -148,6 +148,11 @@ class LandmarkMap:
         return self.world or revision
 
     @property
+    def n_pixels(self) -> int:
+        """How many pixels its images have, all together."""
+        return sum(k.camera.width_px * k.camera.height_px for k in self.keyframes)
+
+    @property
     def seen(self) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
         """(N, V) whether landmark j was seen in keyframe i."""
         return np.asarray(np.isfinite(self.observed_px[:, :, 0]))

@@ -98,7 +98,7 @@ def merged(
             grown.landmark_map,
             parent=senior_revision,
             world=senior.world_of(senior_revision),
-            joined=_joined(senior, junior, junior_revision, there),
+            joined=_joined(senior, senior_revision, junior, junior_revision, there),
         )
         return _checked(replace(grown, landmark_map=named), one, options)
     except ValueError as error:
@@ -300,9 +300,15 @@ def _carried(whole: LandmarkMap, row: Index, junior: Side, stands: Aligned) -> S
 
 
 def _joined(
-    senior: LandmarkMap, junior: LandmarkMap, junior_revision: bytes, there: Similarity
+    senior: LandmarkMap,
+    senior_revision: bytes,
+    junior: LandmarkMap,
+    junior_revision: bytes,
+    there: Similarity,
 ) -> tuple[JoinedMap, ...]:
     """Return what the merged map says of the maps that are in it, the newest last.
+
+    Where the worlds are that the senior knows is not for the junior to say.
 
     Raises:
         ValueError: the junior's world is too far away.
@@ -310,7 +316,12 @@ def _joined(
     own = JoinedMap(junior_revision, junior.world_of(junior_revision), there)
     if not _is_near(own):
         raise ValueError("the other map's world is too far away")
-    brought = [replace(j, world_from_other=there @ j.world_from_other) for j in junior.joined]
+    known = {j.world: j.world_from_other for j in senior.joined}  # of each world the newest
+    known[senior.world_of(senior_revision)] = Similarity.identity()
+    brought = [
+        replace(j, world_from_other=known.get(j.world) or there @ j.world_from_other)
+        for j in junior.joined
+    ]
     brought = [j for j in brought if _is_near(j)] + [own]
     names = {j.revision for j in brought}
     return tuple([j for j in senior.joined if j.revision not in names] + brought)[-MAX_JOINED:]

@@ -11,6 +11,8 @@ from vcl_companion.vision.features import Detector
 
 MOST_KEYFRAMES = 64
 """Of any map that is flown on: what is known of each is in every state of the filter."""
+MOST_PIXELS = 80_000_000
+"""Of all its images together: to be tracked they lie in memory, in all their sizes."""
 
 
 @dataclass(frozen=True)

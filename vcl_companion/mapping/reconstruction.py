@@ -110,12 +110,16 @@ def accepted(landmark_map: LandmarkMap, options: MapOptions) -> LandmarkMap | No
     if n < options.min_landmarks:
         return NoMap(f"{n} landmarks could be placed, {options.min_landmarks} needed")
     try:
-        covariance = map_uncertainty(landmark_map, options.calibration_px).marginal()
+        sure = map_uncertainty(landmark_map, options.calibration_px)
     except ValueError as error:
         return NoMap(str(error))
+    bodies = np.array([k.world_from_body.translation for k in landmark_map.keyframes])
+    away = np.linalg.norm(landmark_map.points_world[:, None] - bodies, axis=2)
+    away[~landmark_map.seen] = np.inf
+    nearest = away.argmin(axis=1)
+    covariance = sure.seen_from(landmark_map.keyframes, nearest)
     sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-    depth = np.linalg.norm(landmark_map.points_world, axis=1)
-    vague = float(np.median(sigma / depth))
+    vague = float(np.median(sigma / away[np.arange(n), nearest]))
     if vague > options.max_depth_error:
         return NoMap(
             f"landmarks are known to {100 * vague:.0f} % of their distance, "

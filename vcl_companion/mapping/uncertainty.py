@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from vcl_companion.compiled import writable
 from vcl_companion.geometry.pose import adjoint
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.lens_errors import lenses_px, n_lens_causes
 from vcl_companion.mapping.misplacement import N_FIELDS, misplacement
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
@@ -69,6 +69,23 @@ class MapUncertainty:
     def marginal(self) -> Array:
         """Return (N, 3, 3) the whole covariance of each landmark, m^2."""
         return self._with_shared(np.arange(len(self.landmark_lever), dtype=np.int64), 1.0)
+
+    def seen_from(self, keyframes: tuple[Keyframe, ...], by: NDArray[np.intp]) -> Array:
+        """Return (N, 3, 3) how well it is known where each landmark is from a keyframe, m^2.
+
+        However far both are from where the world begins, or vague together.
+
+        Args:
+            keyframes: the map's.
+            by: (N,) from which of them.
+        """
+        lever = self.landmark_lever.copy()
+        for i, keyframe in enumerate(keyframes):
+            own = slice(6 * i, 6 * i + 3)
+            lever[by == i, :, own] -= keyframe.world_from_body.rotation.astype(np.float32)
+        landmarks = np.arange(len(lever), dtype=np.int64)
+        shared = carried(lever, self.keyframe_covariance, landmarks)
+        return np.asarray(shared + self.landmark_covariance)
 
     def for_matching(self, landmarks: NDArray[np.int64]) -> Array:
         """Return (M, 3, 3) covariances that tell sightings of some landmarks from wrong ones.

@@ -1,0 +1,95 @@
+"""A peer's map tried on frames of our own, before it is flown on.
+
+What is compared with the map in use is named by whoever made the other one (``agreement``). What
+our camera has seen is not: a frame whose place is known on the map in use must be found at the
+same place on the other. Where the other does not show it, that says nothing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vcl_companion.cameras.source import Frame
+from vcl_companion.daemon.estimator import Estimator
+from vcl_companion.daemon.frame_history import FrameHistory
+from vcl_companion.daemon.map_offer import ReadyMap
+from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.mishaps import fix_or_none
+from vcl_companion.geometry.similarity import Similarity
+from vcl_companion.localization.filter_state import FilterState, carried
+from vcl_companion.localization.fix import Localized, Prior
+from vcl_companion.localization.pipeline import Effort
+from vcl_companion.mapping.agreement import moved_frame
+
+# Frames that are not older than this, and this far apart.
+_LATEST_NS, _APART_NS = 2_000_000_000, 200_000_000
+# One frame may be found at a place that looks alike: so many must say the same.
+_N_FRAMES = 2
+
+
+class MapTrial:
+    """Holds maps against what our own frames have shown.
+
+    Args:
+        frames: our own.
+        maps: the map in use.
+        estimator: which of them had a fix on it.
+        work: looks for frames.
+    """
+
+    def __init__(
+        self, frames: FrameHistory, maps: MapStore, estimator: Estimator, work: MapWork
+    ) -> None:
+        self._frames = frames
+        self._maps = maps
+        self._estimator = estimator
+        self._work = work
+
+    async def contradiction(self, ready: ReadyMap, other_from_world: Similarity | None) -> str:
+        """Say how our frames contradict a map; empty if they do not, or say nothing.
+
+        Args:
+            ready: the map.
+            other_from_world: takes the world of the map in use to its; None where it is the same.
+        """
+        current, reason = self._maps.current, ""
+        if current is None:
+            return ""
+        for frame, state in self._known():
+            there = state if other_from_world is None else carried(state, other_from_world)
+            pose, covariance = there.world_from_body, there.pose_covariance()
+            effort = Effort(may_fall_back=False, has_heading=self._estimator.has_heading)
+            looking = self._work.find(
+                np.asarray(frame.image),
+                ready.stored(),
+                Prior(pose, covariance),
+                state.ned_from_body,
+                effort,
+            )
+            fix = await fix_or_none(looking)
+            if not isinstance(fix, Localized):
+                return ""
+            reason = moved_frame(
+                pose, covariance, fix.world_from_body, fix.noise_covariance,
+                current.index.landmark_map,
+            )  # fmt: skip
+            if not reason:
+                return ""
+        return reason
+
+    def _known(self) -> list[tuple[Frame, FilterState]]:
+        """Return our latest frames that had a fix on the map, and what was believed there."""
+        newest = self._frames.newest
+        known: list[tuple[Frame, FilterState]] = []
+        if newest is None:
+            return known
+        until_ns = newest.captured_at_ns
+        for frame in reversed(self._frames.after(newest.captured_at_ns - _LATEST_NS)):
+            state = self._estimator.own_fix_at(frame.captured_at_ns)
+            if state is not None and frame.captured_at_ns <= until_ns:
+                known.append((frame, state))
+                until_ns = frame.captured_at_ns - _APART_NS
+            if len(known) == _N_FRAMES:
+                break
+        return known
