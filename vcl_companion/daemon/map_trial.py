@@ -13,7 +13,7 @@ from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.frame_history import FrameHistory
 from vcl_companion.daemon.map_offer import ReadyMap
-from vcl_companion.daemon.map_store import MapStore
+from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.mishaps import fix_or_none
 from vcl_companion.geometry.similarity import Similarity
@@ -58,25 +58,39 @@ class MapTrial:
             return ""
         for frame, state in self._known():
             there = state if other_from_world is None else carried(state, other_from_world)
-            pose, covariance = there.world_from_body, there.pose_covariance()
-            effort = Effort(may_fall_back=False, has_heading=self._estimator.has_heading)
-            looking = self._work.find(
-                np.asarray(frame.image),
-                ready.stored(),
-                Prior(pose, covariance),
-                state.ned_from_body,
-                effort,
-            )
-            fix = await fix_or_none(looking)
-            if not isinstance(fix, Localized):
+            moved = await self._moved(frame, there, ready.stored(), current, may_track=True)
+            if not moved:
                 return ""
-            reason = moved_frame(
-                pose, covariance, fix.world_from_body, fix.noise_covariance,
-                current.index.landmark_map,
-            )  # fmt: skip
-            if not reason:
+            # We may be the one who is wrong: then ours, looked through, does not confirm it either.
+            if await self._moved(frame, state, current, current, may_track=False) != "":
                 return ""
+            reason = moved
         return reason
+
+    async def _moved(
+        self,
+        frame: Frame,
+        state: FilterState,
+        on: StoredMap,
+        current: StoredMap,
+        *,
+        may_track: bool,
+    ) -> str | None:
+        """Say how far off from where a frame is believed it is found; None where it is not."""
+        pose, covariance = state.world_from_body, state.pose_covariance()
+        effort = Effort(
+            may_track=may_track,
+            may_fall_back=False,
+            has_heading=self._estimator.has_heading,
+        )
+        prior = Prior(pose, covariance) if may_track else None
+        image = np.asarray(frame.image)
+        fix = await fix_or_none(self._work.find(image, on, prior, state.ned_from_body, effort))
+        if not isinstance(fix, Localized):
+            return None
+        landmark_map = current.index.landmark_map
+        found, noise = fix.world_from_body, fix.noise_covariance
+        return moved_frame(pose, covariance, found, noise, landmark_map)
 
     def _known(self) -> list[tuple[Frame, FilterState]]:
         """Return our latest frames that had a fix on the map, and what was believed there."""
