@@ -26,6 +26,7 @@ from sitl.shots import RecordedShots, Shots
 from sitl.swarm import Swarm
 from sitl.trajectory_files import write_trajectories
 from vcl_companion.daemon.scheduling import run_among_others, run_before_others
+from vcl_companion.mapping.options import MapOptions
 from vcl_companion.recording import read_recording
 from vcl_companion.wire.warm_up import warm_up
 
@@ -162,9 +163,9 @@ async def _play(
     flat_out = math.isinf(speed)
     frames_at_ns = [drone.frames_at_ns for drone in plan.drones]
     moments = instants(frames_at_ns, flat_out)
-    late = seconds_late(plan.options.absences)
-    there = {n for n, drone in enumerate(plan.drones) if drone.name not in late}
-    holds_after = gate(moments, there)
+    holds_after = gate(
+        moments, {n for n, drone in enumerate(plan.drones) if drone.name in plan.waited_for}
+    )
     n_frames = sum(map(len, frames_at_ns))
     n_given = 0
     begun_s = time.monotonic()
@@ -219,11 +220,11 @@ async def _hand_out(moment: Instant, plan: FlightPlan, swarm: Swarm, shots: Shot
 
 
 async def _first_map(plan: FlightPlan, swarm: Swarm, conduct: Conduct) -> None:
-    """Hold the recording until every drone's first frame is answered, or the time is up.
+    """Hold the recording until the first frames given so far are answered, or the time is up.
 
     A swarm without a map is still flown: what it says about it is the result.
     """
-    timeout_s = plan.options.start_timeout_s
+    timeout_s = first_map_timeout_s(plan)
     try:
         async with asyncio.timeout(timeout_s):
             for drone in swarm.drones:
@@ -233,6 +234,16 @@ async def _first_map(plan: FlightPlan, swarm: Swarm, conduct: Conduct) -> None:
             if drone.camera.unanswered():
                 why = f"first frame not answered within {timeout_s:.0f} s; flown on without"
                 conduct.events.append(Event(0.0, drone.planned.name, "harness", why))
+
+
+def first_map_timeout_s(plan: FlightPlan) -> float:
+    """Return for how long the recording stands still for the first map at most, wall clock."""
+    timeout_s = plan.options.start_timeout_s
+    late = seconds_late(plan.options.absences).keys()
+    if plan.waited_for | late != {drone.name for drone in plan.drones}:
+        # The daemon of who begins later is there, and is asked for a frame that it has not.
+        timeout_s += MapOptions().gather_timeout_s
+    return timeout_s
 
 
 class _Maps:

@@ -65,12 +65,12 @@ def instants(frames_at_ns: Sequence[NDArray[np.int64]], flat_out: bool) -> list[
 def gate(moments: Sequence[Instant], drones: Collection[int]) -> int:
     """Return the index of the moment after which the recording waits for the first map.
 
-    Every drone has been given its first frame by then, and, unless a second one
+    Every drone of it has been given its first frame by then, and, unless a second one
     is due before, the attitude sample after it.
 
     Args:
         moments: of the recording.
-        drones: those that are there from the start.
+        drones: those of the first map.
     """
     given: set[int] = set()
     for k, moment in enumerate(moments):

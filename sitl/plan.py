@@ -6,7 +6,7 @@ import math
 import re
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from sitl.absences import Absence, Blindness, check_absences, check_times, seconds_late
 from sitl.firmware import FirmwareBinary
+from sitl.first_map import beginning, instants_of, n_before
+from sitl.known_distances import known_distances, known_pairs
 from sitl.mission import Mission
 from sitl.network import NetworkOptions
 from sitl.partitions import check_partitions
@@ -49,7 +51,7 @@ class FlyOptions:
             maps included.
         attitude: output folder of an earlier flight whose attitude streams are sent again.
         known_distances: instead of the recording's; a pair without metres is taken
-            from the truth when all are there.
+            from the truth when the first map is made.
         drones: names of those that fly; empty: all.
         start_timeout_s: how long the daemons have to come up, and again to make the first map.
         settings: more of the daemons' configuration.
@@ -88,16 +90,18 @@ class PlannedDrone:
     """One drone of a flight.
 
     Attributes:
-        drone: what it recorded.
+        drone: what it recorded, of which it flies all frames.
         system_id: its MAVLink system id.
         attitude_path: attitude stream that is sent again; None: made from the truth.
         mission: what it does by itself in a live flight; None in a recorded one.
+        n_left_out: how many frames it recorded before these, that no first map could be made of.
     """
 
     drone: Drone
     system_id: int
     attitude_path: Path | None
     mission: Mission | None = None
+    n_left_out: int = 0
 
     @property
     def name(self) -> str:
@@ -107,7 +111,7 @@ class PlannedDrone:
     @property
     def frames_at_ns(self) -> NDArray[np.int64]:
         """(F,) instants of its frames."""
-        return np.array([frame.at_ns for frame in self.drone.frames], dtype=np.int64)
+        return instants_of(self.drone)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +124,7 @@ class FlightPlan:
         leader: name of the one whose start is the origin.
         known_distances: (system id, system id, m).
         options: how it is flown.
+        waited_for: names of those whose first frame the recording waits with for the first map.
     """
 
     recording: Recording
@@ -127,6 +132,7 @@ class FlightPlan:
     leader: str
     known_distances: tuple[tuple[int, int, float], ...]
     options: FlyOptions
+    waited_for: frozenset[str]
 
     @property
     def are_distances_recorded(self) -> bool:
@@ -146,22 +152,6 @@ class FlightPlan:
     def system_id(self, name: str) -> int:
         """Return a drone's MAVLink system id."""
         return next(drone.system_id for drone in self.drones if drone.name == name)
-
-
-def parse_known_distance(text: str) -> KnownPair:
-    """Return what ``mav0:mav1=1.63`` or ``mav0:mav1`` says.
-
-    Raises:
-        ConfigError: it has another form.
-    """
-    names, equals, metres = text.partition("=")
-    a, colon, b = (part.strip() for part in names.partition(":"))
-    try:
-        if colon and a and b:
-            return KnownPair(a, b, float(metres) if equals else None)
-    except ValueError:
-        pass
-    raise ConfigError(f"--known-distance {text}: expected two drones, like mav0:mav1=1.63 (metres)")
 
 
 def parse_setting(text: str) -> Setting:
@@ -207,20 +197,32 @@ def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:
         if options.drones.count(name) > 1:
             raise ConfigError(f"--drones: {name} is given twice")
     flying = [name for name in names if not options.drones or name in options.drones]
-    drones = tuple(
-        PlannedDrone(drone, n + 1, _attitude_path(drone, options))
-        for n, drone in enumerate(recording.drones)
-        if drone.name in flying
-    )
-    for planned in drones:
-        _check_instants(planned.drone)
-    pairs = _known_pairs(recording, drones, options.known_distances, options.absences)
+    recorded = [drone for drone in recording.drones if drone.name in flying]
+    attitudes = {drone.name: _attitude_path(drone, options) for drone in recorded}
+    for drone in recorded:
+        _check_instants(drone)
+    late = seconds_late(options.absences)
+    pairs = known_pairs(recording, recorded, options.known_distances, late)
+    leader = recording.leader if recording.leader in flying else flying[0]
+    # That nobody is there is said below, where it is known how long the flight is.
+    there = [drone for drone in recorded if drone.name not in late] or recorded
+    begins = beginning(there, leader, pairs)
+    left_out = {drone.name: n_before(drone, begins.at_ns) for drone in recorded}
+    flown = [replace(drone, frames=drone.frames[left_out[drone.name] :]) for drone in recorded]
+    ids = {name: n + 1 for n, name in enumerate(names)}
     plan = FlightPlan(
         recording=recording,
-        drones=drones,
-        leader=recording.leader if recording.leader in flying else flying[0],
-        known_distances=_known_distances(drones, pairs, options.absences),
+        drones=tuple(
+            PlannedDrone(d, ids[d.name], attitudes[d.name], n_left_out=left_out[d.name])
+            for d in flown
+        ),
+        leader=leader,
+        known_distances=tuple(
+            (ids[a], ids[b], distance_m)
+            for a, b, distance_m in known_distances(flown, pairs, late, begins.at_ns)
+        ),
         options=options,
+        waited_for=begins.drones,
     )
     duration_s = (plan.ends_at_ns - plan.starts_at_ns) * 1e-9
     check_partitions(options.network.partitions, flying, duration_s)
@@ -246,37 +248,9 @@ def _attitude_path(drone: Drone, options: FlyOptions) -> Path | None:
     return None
 
 
-def _known_pairs(
-    recording: Recording,
-    drones: Sequence[PlannedDrone],
-    given: Sequence[KnownPair],
-    absences: Sequence[Absence],
-) -> Sequence[KnownPair]:
-    names = [drone.name for drone in drones]
-    for pair in given:
-        for name in (pair.a, pair.b):
-            if name not in names:
-                raise ConfigError(f"--known-distance: {name!r} does not fly ({', '.join(names)})")
-        if sum({pair.a, pair.b} == {other.a, other.b} for other in given) > 1:
-            raise ConfigError(f"--known-distance {pair.a}:{pair.b}: is given twice")
-    pairs = given or [p for p in recording.known_distances if {p.a, p.b} <= set(names)]
-    late = seconds_late(absences).keys()
-    if not given and any({p.a, p.b} & late for p in pairs):
-        # How far who comes late is away then nobody has measured.
-        there = [d.name for d in drones if d.name not in late and d.drone.truth is not None][:2]
-        of_others = [KnownPair(there[0], there[1], None)] if len(there) == 2 else pairs
-        pairs = [p for p in pairs if not {p.a, p.b} & late] or of_others
-    if not pairs and len(drones) > 1:
-        raise ConfigError(
-            f"{recording.path}: no distance is known between two of {', '.join(names)}; "
-            f"give --known-distance {names[0]}:{names[1]}=METRES"
-        )
-    return pairs
-
-
 def _check_instants(drone: Drone) -> None:
     """Refuse a truth of another time, and instants that are no nanoseconds."""
-    at_ns = np.array([frame.at_ns for frame in drone.frames], dtype=np.int64)
+    at_ns = instants_of(drone)
     if drone.truth is not None and not any(drone.truth.pose_at(int(t)) for t in at_ns):
         raise ConfigError(
             f"{drone.name}: frames from {at_ns[0]} to {at_ns[-1]} ns, and no ground truth of any: "
@@ -288,48 +262,3 @@ def _check_instants(drone: Drone) -> None:
             f"{drone.name}: {rate_hz:g} frames a second by their instants, "
             f"{drone.sensor.rate_hz:g} by its sensor.yaml: instants are nanoseconds"
         )
-
-
-def _known_distances(
-    drones: Sequence[PlannedDrone], pairs: Sequence[KnownPair], absences: Sequence[Absence]
-) -> tuple[tuple[int, int, float], ...]:
-    by_name = {drone.name: drone for drone in drones}
-    out = []
-    for pair in pairs:
-        one, other = by_name[pair.a], by_name[pair.b]
-        distance_m = pair.distance_m
-        if distance_m is None:
-            distance_m = _true_distance_m(one, other, _all_there_ns(drones, pair, absences))
-        if distance_m is None:
-            raise ConfigError(
-                f"the truth does not say how far {pair.a} is from {pair.b} at the start; "
-                f"give --known-distance {pair.a}:{pair.b}=METRES"
-            )
-        out.append((one.system_id, other.system_id, distance_m))
-    return tuple(out)
-
-
-def _all_there_ns(
-    drones: Sequence[PlannedDrone], pair: KnownPair, absences: Sequence[Absence]
-) -> int:
-    """Return when a first map can be made whose scale a pair gives: the recording waits for it."""
-    late = seconds_late(absences)
-    first_ns = {drone.name: int(drone.frames_at_ns[0]) for drone in drones}
-    needed = [name for name in first_ns if name not in late or name in (pair.a, pair.b)]
-    begins_ns = min(first_ns.values())
-    return max(max(first_ns[n], begins_ns + round(late.get(n, 0.0) * 1e9)) for n in needed)
-
-
-def _true_distance_m(a: PlannedDrone, b: PlannedDrone, at_ns: int) -> float | None:
-    """Return how far two drones are apart at their newest frames of then, by the truth."""
-    starts = []
-    for planned in (a, b):
-        truth = planned.drone.truth
-        n_come = int(np.searchsorted(planned.frames_at_ns, at_ns, side="right"))
-        newest_ns = int(planned.frames_at_ns[max(n_come - 1, 0)])
-        start = truth.pose_at(newest_ns) if truth else None
-        if start is None:
-            return None
-        starts.append(start.translation)
-    distance_m = float(np.linalg.norm(starts[0] - starts[1]))
-    return distance_m if distance_m > 0.0 else None

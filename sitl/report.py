@@ -7,8 +7,9 @@ Terms beyond ``sitl.evaluation``'s:
 * ``frames_localized``, ``frames_refused``, ``frames_dropped``: what the daemon's
   log says of each frame; ``unaccounted`` is what it says nothing about.
 * ``latency_ms``: from a frame's arrival in the daemon to its outcome, of frames
-  that were looked at. A drone's first frame waits for the first map by design
-  and is told apart as ``first_frame_ms``.
+  that were looked at. The first frames that the recording stands still with until there
+  is a first map wait for that by design, and are told apart as ``first_frame_ms``; null for
+  who begins later.
 * ``landmarks``: median number of landmarks that a frame's own pose rests on.
 * ``sources``: ``share`` of the frames whose pose was the frame's own (``intra``),
   a peer's alone (``inter``), or both (``fused``); ``nees_median`` and ``ate_m`` of
@@ -142,12 +143,8 @@ def _attitude_of(options: FlyOptions) -> str:
 
 def _drone(drone: DroneResult, duration_s: float) -> dict[str, Any]:
     scores, log, summary = drone.scores, drone.log, drone.log.summary
-    first = [f.latency_ms for f in log.frames if f.sequence == 0]
-    looked_at = [
-        frame.latency_ms
-        for frame in log.frames
-        if frame.sequence > 0 and frame.latency_ms is not None and frame.outcome != "dropped"
-    ]
+    first = [f.latency_ms for f in log.frames if drone.waits_for_map and f.sequence == 0]
+    looked_at = [frame.latency_ms for frame in drone.looked_at if frame.latency_ms is not None]
     localized = [frame for frame in log.frames if frame.outcome == "localized"]
     inliers = [frame.inliers for frame in localized if frame.source != "inter"]
     sent = summary.peer_bytes_sent if summary else None

@@ -105,7 +105,7 @@ _ERROR_NOTE = (
 )
 _LATENCY_NOTE = (
     "From a frame's arrival in the daemon to its outcome, of the frames that were looked at. The "
-    "first frame waits for the first map and is told apart."
+    "first frame of who is there from the start waits for the first map and is told apart."
 )
 
 _FUSED_NOTE = (

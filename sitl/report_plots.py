@@ -97,8 +97,7 @@ def latency_svg(result: FlightResult) -> str:
         figure = Figure(figsize=(WIDTH_IN, 2.9), layout="constrained")
         over_time, share = figure.subplots(1, 2, width_ratios=(2, 1))
         for n, drone in enumerate(result.drones):
-            frames = [f for f in drone.log.frames if f.sequence > 0 and f.outcome != "dropped"]
-            frames = [frame for frame in frames if frame.latency_ms is not None]
+            frames = drone.looked_at
             at_s = seconds([f.captured_at_ns for f in frames], result.plan.starts_at_ns)
             latency_ms = np.array([f.latency_ms for f in frames], dtype=float)
             over_time.plot(

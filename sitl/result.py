@@ -18,7 +18,7 @@ from sitl.evaluation import (
     scores,
 )
 from sitl.firmware import FirmwareBinary
-from sitl.flight_log import FlightLog, MapRow, PropagatedRow, estimates_of, read_received
+from sitl.flight_log import FlightLog, FrameRow, MapRow, PropagatedRow, estimates_of, read_received
 from sitl.flown_mission import FlownMission, read_mission
 from sitl.fused import Fused, read_fused
 from sitl.lives import Life, Lives, read_lives, read_log
@@ -68,6 +68,7 @@ class DroneResult:
         mission: how it was flown; None in a recorded flight.
         given: (G,) which frames a living daemon was given.
         lives: of its daemon, in order.
+        waits_for_map: whether the recording stands still, with its first frame, for the first map.
     """
 
     name: str
@@ -85,6 +86,7 @@ class DroneResult:
     mission: FlownMission | None
     given: NDArray[np.int64]
     lives: tuple[Life, ...]
+    waits_for_map: bool
 
     @property
     def n_frames(self) -> int:
@@ -113,6 +115,17 @@ class DroneResult:
     @property
     def _coasted(self) -> set[int]:
         return {frame.sequence for frame in self.log.frames if frame.by == "motion"}
+
+    @property
+    def looked_at(self) -> list[FrameRow]:
+        """Frames that were looked at as they came: not dropped, and no wait for the first map."""
+        return [
+            frame
+            for frame in self.log.frames
+            if frame.latency_ms is not None
+            and frame.outcome != "dropped"
+            and not (self.waits_for_map and frame.sequence == 0)
+        ]
 
     @property
     def unaccounted(self) -> int:
@@ -186,6 +199,7 @@ def gather(plan: FlightPlan, out: Path, events: Iterable[Event] = ()) -> FlightR
             alignment,
             lives.get(d.name),
             firmware,
+            waits_for_map=d.name in plan.waited_for,
         )
         for d in plan.drones
     )
@@ -193,6 +207,7 @@ def gather(plan: FlightPlan, out: Path, events: Iterable[Event] = ()) -> FlightR
     maps = logs[mapped_by].maps
     points = _map_points(out / "run" / mapped_by / "maps", maps)
     said = [*events, *_logged(plan, logs), *(e for d in drones for e in _doubts(d))]
+    said += _left_out(plan)
     if network is not None:
         said += _network_doubts(network)
     if alignment is None and any(d.truth and any(d.truth) for d in drones):
@@ -220,6 +235,8 @@ def _drone_result(
     alignment: Pose | None,
     lives: Lives | None,
     firmware: FirmwareBinary | None,
+    *,
+    waits_for_map: bool,
 ) -> DroneResult:
     errors = None
     every = range(len(planned.drone.frames))
@@ -255,6 +272,7 @@ def _drone_result(
         ),
         given=np.array(every if lives is None else lives.frames, dtype=np.int64),
         lives=() if lives is None else tuple(lives.lives),
+        waits_for_map=waits_for_map,
     )
 
 
@@ -382,6 +400,20 @@ def _logged(plan: FlightPlan, logs: dict[str, FlightLog]) -> list[Event]:
         )
         for name, log in logs.items()
         for row in log.events
+    ]
+
+
+def _left_out(plan: FlightPlan) -> list[Event]:
+    """Return whose frames were not flown, as no first map can be made of them."""
+    return [
+        Event(
+            0.0,
+            drone.name,
+            "harness",
+            f"{drone.n_left_out} frames not flown: from before all are there for a first map",
+        )
+        for drone in plan.drones
+        if drone.n_left_out
     ]
 
 

@@ -145,9 +145,10 @@ def fly(
     from sitl.embedded import DEMO
     from sitl.firmware import parse_firmware
     from sitl.fly import fly as fly_recording
+    from sitl.known_distances import parse_known_distance
     from sitl.network import NetworkOptions
     from sitl.partitions import parse_partition
-    from sitl.plan import FlyOptions, parse_known_distance, parse_setting, pipeline_setting
+    from sitl.plan import FlyOptions, parse_setting, pipeline_setting
     from sitl.terminal import progress_shown, show_report
 
     if parameters and not autopilot:

@@ -7,8 +7,9 @@ import pytest
 
 from sitl.absences import Absence
 from sitl.fly import fly
+from sitl.known_distances import parse_known_distance
 from sitl.out_folder import prepare_folder
-from sitl.plan import FlyOptions, Setting, parse_known_distance, parse_setting, plan_flight
+from sitl.plan import FlyOptions, Setting, parse_setting, plan_flight
 from tests.sitl.flights import Flight, at_ns, ned_from_body, write_recording
 from vcl_companion.errors import ConfigError
 from vcl_companion.recording import KnownPair, Recording, read_recording

@@ -1,6 +1,7 @@
 import io
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -130,6 +131,27 @@ def test_no_figure_is_cut_on_a_narrow_terminal(tmp_path: Path, width: int) -> No
     words = printed.getvalue().split()
     for figure in ("0.123", "12.34", "118.1", "1150.9", "2048"):
         assert words.count(figure) == 1
+
+
+def test_the_first_frame_of_who_begins_later_is_one_like_all_others(tmp_path: Path) -> None:
+    plan, out = leave_behind(tmp_path, Flight(n_frames=12))
+    assert plan.waited_for == {"mav0", "mav1"}
+    report = report_of(gather(replace(plan, waited_for=frozenset({"mav0"})), out))
+    waits, comes = report["drones"]["mav0"], report["drones"]["mav1"]
+    assert waits["first_frame_ms"] == 900.0
+    assert waits["latency_ms"]["p99"] < 32.0
+    assert comes["first_frame_ms"] is None
+    assert comes["latency_ms"]["p99"] > 800.0
+
+
+def test_frames_that_were_not_flown_are_told_of(tmp_path: Path) -> None:
+    plan, out = leave_behind(tmp_path, Flight())
+    begun = tuple(replace(d, n_left_out=15 if d.name == "mav0" else 0) for d in plan.drones)
+    result = gather(replace(plan, drones=begun), out)
+    (said,) = (event for event in result.events if event.kind == "harness")
+    assert said.drone == "mav0"
+    assert said.reason.startswith("15 frames not flown")
+    assert "15 frames not flown" in page_of(result, out)
 
 
 def test_without_a_partition_there_are_no_phases(tmp_path: Path) -> None:
