@@ -63,6 +63,9 @@ PARAMETERS = {
 }
 _HEARTBEAT_S = 1.0
 _TIMESYNC_PERIOD_NS = 100_000_000
+# A recording's pause may be of hours. Nobody asks for what was said before its last minute, and all
+# of it at once would take minutes to say, and more than a socket holds.
+_LONGEST_SAID_NS = 60_000_000_000
 _YAW_SOURCE, _BY_VISION = "EK3_SRC1_YAW", 6.0
 _SET_GLOBAL_ORIGIN = 611  # not in pymavlink's dialects
 _ACCEPTED: int = dialect.MAV_RESULT_ACCEPTED
@@ -163,18 +166,24 @@ class StandIn:
         return {}
 
     def advance_to(self, until_ns: int) -> int:
-        """Send what is due up to an instant of the recording; return the time it is then."""
+        """Send what is due up to an instant of the recording; return the time it is then.
+
+        After a pause of more than a minute it is the last minute's.
+        """
         self.receive()
         if self._now_ns is not None and until_ns <= self._now_ns:
             return self._now_ns
+        since_ns = self._now_ns
+        if since_ns is not None:
+            since_ns = max(since_ns, until_ns - _LONGEST_SAID_NS)
         due: list[tuple[int, Callable[[], None]]] = [
             (at_ns, partial(self._send_attitude, at_ns, quaternion))
-            for at_ns, quaternion in self._options.source.between(self._now_ns, until_ns)
+            for at_ns, quaternion in self._options.source.between(since_ns, until_ns)
         ]
-        if self._now_ns is not None:
-            due += _every(_TIMESYNC_PERIOD_NS, self._now_ns, until_ns, self._ask_for_time)
+        if since_ns is not None:
+            due += _every(_TIMESYNC_PERIOD_NS, since_ns, until_ns, self._ask_for_time)
             for message_id, interval_ns in self._interval_ns.items():
-                due += _every(interval_ns, self._now_ns, until_ns, self._streams[message_id])
+                due += _every(interval_ns, since_ns, until_ns, self._streams[message_id])
         for at_ns, send in sorted(due, key=lambda item: item[0]):
             self._now_ns = max(at_ns, self._now_ns or at_ns)
             send()

@@ -324,6 +324,25 @@ def test_a_replay_sends_the_same_attitudes_again(tmp_path: Path) -> None:
     assert set(instants) < set(attitude_rows(first)[0])
 
 
+def test_a_pause_of_hours_is_nothing_that_ends_it(tmp_path: Path) -> None:
+    """Flat out a recording's pause is one step; an autopilot says its last minute."""
+    pause_ns = 3 * 3600 * 1000 * MS
+
+    async def scenario() -> None:
+        async with stand_in(tmp_path / "mav", truth(tmp_path)) as process:
+            for at_ns in (START_NS, START_NS + pause_ns, START_NS + pause_ns + 20 * MS):
+                await process.advance_to(at_ns)
+            await process.finish()
+
+    asyncio.run(scenario())
+    at_ns, _ = attitude_rows(tmp_path / "mav")
+    said = np.array(at_ns) - START_NS
+    assert said[0] == 0
+    assert pause_ns - 60_000 * MS < said[1] <= pause_ns - 59_980 * MS
+    assert said[-2:].tolist() == [pause_ns, pause_ns + 20 * MS]
+    assert np.diff(said[1:]).tolist() == [20 * MS] * 3000
+
+
 def test_time_does_not_run_back_and_nonsense_ends_it(tmp_path: Path) -> None:
     async def scenario() -> None:
         async with stand_in(tmp_path / "mav", truth(tmp_path)) as process:
