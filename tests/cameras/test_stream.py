@@ -277,11 +277,15 @@ def test_an_image_that_cannot_be_decoded_is_refused_and_left_out(
     images = [png(picture(0)), b"nonsense", png(picture(2))]
     records = [StreamFrame(k, k + 1, data) for k, data in enumerate(images)]
 
+    left_out: list[tuple[int, int]] = []
+
     async def scenario() -> list[int]:
         async with camera_of(serving(*records, StreamEnd(4)), SystemClock()) as camera:
+            camera.left_out = lambda sequence, at_ns: left_out.append((sequence, at_ns))
             return [frame.sequence for frame in await all_frames(camera)]
 
     assert asyncio.run(scenario()) == [0, 2]
+    assert left_out == [(1, 2)]
     assert "frame 1 is left out: undecodable image of 8 bytes" in caplog.text
 
 

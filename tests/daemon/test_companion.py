@@ -196,6 +196,7 @@ async def flight(
         maps, history = MapStore(""), FrameHistory()
         health = Health(link, log)
         outcomes = FrameOutcomes(camera, clock, health, log)
+        camera.left_out = outcomes.undecodable
         motion = FilterOptions(coast_s=coast_s)
         estimator = Estimator(motion, OPTIONS.localization, lambda _: None)
         teller = Teller(link, estimator, clock, log, rates)
@@ -272,6 +273,27 @@ def test_frames_become_poses_near_the_truth(tmp_path: Path) -> None:
             newest = up.history.newest
             assert newest is not None
             assert newest.sequence == 2
+
+    run(scenario())
+
+
+def test_a_frame_whose_image_cannot_be_decoded_is_refused_and_logged(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            for k in range(3):
+                if k == 1:
+                    up.give_image(k, b"nonsense")
+                else:
+                    up.give(k)
+                await up.server.answered()
+            assert up.frames() == [
+                (0, "localized", None),
+                (1, "refused", "undecodable image"),
+                (2, "localized", None),
+            ]
+            # It was no frame that the camera's driver dropped.
+            assert up.log.frames == {"localized": 2, "refused": 1, "dropped": 0}
 
     run(scenario())
 

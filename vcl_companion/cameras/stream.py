@@ -216,6 +216,8 @@ class StreamCamera:
         self._closed = False
         self.is_busy: Callable[[], bool] = lambda: False
         """What a question is answered by."""
+        self.left_out: Callable[[int, int], None] = lambda _sequence, _at_ns: None
+        """Is told of a frame whose image cannot be decoded; it is answered, and never yielded."""
 
     async def frames(self) -> AsyncIterator[Frame]:
         """Connect and yield until the end record; see ``CameraSource``."""
@@ -238,6 +240,7 @@ class StreamCamera:
                     image = await asyncio.to_thread(decode_image, record.encoded)
                 except WireError as error:
                     _log.warning("frame %d is left out: %s", sequence, error)
+                    self.left_out(sequence, at_ns)
                     self._say(sequence, "refused")
                     continue
                 if image.shape[::-1] != self._size_px:

@@ -246,8 +246,9 @@ async def _run(config: Config) -> int:
         lambda: group.stretch,
     )
     exchange.attach(peers)
-    if isinstance(camera, StreamCamera):  # no other camera asks
+    if isinstance(camera, StreamCamera):  # no other camera asks, or is asked for each frame
         camera.is_busy = exchange.is_busy
+        camera.left_out = outcomes.undecodable
     saved = SavedMap(maps, exchange.go_back_to, estimator, disk, autopilot, log)
     requests = MessageRequests(autopilot, OnboardComputer(Path()), disk)
     commands = Commands(autopilot, exchange, maps, estimator, teller, saved, requests, log)

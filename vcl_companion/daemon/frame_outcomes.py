@@ -16,6 +16,8 @@ from vcl_companion.localization.fix import NotLocalized
 
 _log = logging.getLogger(__name__)
 
+_UNDECODABLE = "undecodable image"
+
 
 @dataclass(frozen=True)
 class _Sent:
@@ -51,10 +53,14 @@ class FrameOutcomes:
 
     def opened(self, frame: Frame) -> None:
         """Note a frame that has come, and those that the camera's driver dropped before it."""
-        if self._last_sequence is not None and frame.sequence > self._last_sequence + 1:
-            self._log.missed(frame.sequence - self._last_sequence - 1)
-        self._last_sequence = frame.sequence
+        self._came(frame.sequence)
         self._open.append(frame)
+
+    def undecodable(self, sequence: int, captured_at_ns: int) -> None:
+        """Log a frame that the camera has answered itself, for its image cannot be decoded."""
+        self._came(sequence)
+        self._health.refused(_UNDECODABLE)
+        self._log.frame(sequence, captured_at_ns, "refused", reason=_UNDECODABLE)
 
     def sent(
         self,
@@ -128,6 +134,11 @@ class FrameOutcomes:
                 self.close(frame)
             else:
                 self._log_refused(frame, NotLocalized("the service has ended"))
+
+    def _came(self, sequence: int) -> None:
+        if self._last_sequence is not None and sequence > self._last_sequence + 1:
+            self._log.missed(sequence - self._last_sequence - 1)
+        self._last_sequence = sequence
 
     def _log_refused(self, frame: Frame, why: NotLocalized, by: Basis | None = None) -> None:
         self._log.frame(
