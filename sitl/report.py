@@ -2,6 +2,7 @@
 
 Terms beyond ``sitl.evaluation``'s:
 
+* ``axes``: of the recording's files; ``rmse_m`` is along them.
 * ``localized_share``: frames whose pose reached the autopilot, of all frames; not those
   by attitude and motion alone, which count as refused (errors are of all that was sent).
 * ``frames_localized``, ``frames_refused``, ``frames_dropped``: what the daemon's
@@ -159,6 +160,7 @@ def _drone(drone: DroneResult, duration_s: float) -> dict[str, Any]:
         "ate_m": scores.ate_m if scores else None,
         "ate_aligned_m": scores.ate_aligned_m if scores else None,
         "worst_m": scores.worst_m if scores else None,
+        "axes": drone.axes,
         "rmse_m": dict(zip("xyz", scores.rmse_m if scores else (None,) * 3, strict=True)),
         "yaw_rmse_deg": scores.yaw_rmse_deg if scores else None,
         "within_3_sigma_share": scores.within_3_sigma_share if scores else None,

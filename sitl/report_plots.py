@@ -24,9 +24,11 @@ from sitl.plotting import (
     seconds,
     svg,
 )
+from sitl.recording_axes import along_axes, axis_names, axis_to, sigmas_along_axes
 from sitl.result import DroneResult, FlightResult
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.recording import ReferenceAxes
 
 
 def trajectories_svg(result: FlightResult) -> str:
@@ -36,11 +38,9 @@ def trajectories_svg(result: FlightResult) -> str:
         above, side = figure.subplots(1, 2)
         _draw_flight(above, result, across=1, up=0, up_sign=1.0)
         _draw_flight(side, result, across=0, up=2, up_sign=-1.0)
-        aligned = result.ref_from_world is not None
-        above.set(title="From above", xlabel=_label("y", "east", aligned))
-        above.set(ylabel=_label("x", "north", aligned))
-        side.set(title="From the side", xlabel=_label("x", "north", aligned))
-        side.set(ylabel="height, −z [m]")
+        east, north, height = _directions(result)
+        above.set(title="From above", xlabel=east, ylabel=north)
+        side.set(title="From the side", xlabel=north, ylabel=height)
         handles, labels = above.get_legend_handles_labels()
         figure.legend(
             handles, labels, loc="outside lower center", ncols=len(labels), markerscale=1.6
@@ -49,7 +49,7 @@ def trajectories_svg(result: FlightResult) -> str:
 
 
 def errors_svg(result: FlightResult) -> str | None:
-    """Draw the error along every axis with its 3-sigma band; None without truth."""
+    """Draw the error along the recording's axes with its 3-sigma band; None without truth."""
     shown = [(n, d) for n, d in enumerate(result.drones) if d.errors is not None]
     if not shown:
         return None
@@ -58,9 +58,11 @@ def errors_svg(result: FlightResult) -> str | None:
         grid = figure.subplots(4, len(shown), sharex=True, sharey="row", squeeze=False)
         for column, (n, drone) in enumerate(shown):
             _draw_errors(list(grid[:, column]), drone, colour(n), result.plan.starts_at_ns)
-            grid[0, column].set_title(drone.name, color=colour(n))
+            kind = "" if result.axes else f" ({drone.axes})"
+            grid[0, column].set_title(drone.name + kind, color=colour(n))
             grid[3, column].set(xlabel="time [s]", xlim=_time_limits(result))
-        for row, label in enumerate(("x [cm]", "y [cm]", "z [cm]", "yaw [°]")):
+        labels = [f"{name} [cm]" for name in axis_names(result.axes)]
+        for row, label in enumerate((*labels, "yaw [°]")):
             grid[row, 0].set_ylabel(label)
             _focus_errors(grid[row, 0], shown, row)
         return svg(figure, "Error along every axis with the sent 3-sigma band")
@@ -166,7 +168,7 @@ def _draw_errors(column: Sequence[Axes], drone: DroneResult, ink: str, starts_at
     place = np.searchsorted(drone.frames_at_ns, errors.at_ns)
     for row, axes in enumerate(column):
         error, sigma = np.full((2, len(at_s)), np.nan)
-        error[place], sigma[place] = _error_and_sigma(errors, row)
+        error[place], sigma[place] = _error_and_sigma(errors, drone.axes, row)
         axes.fill_between(at_s, -3 * sigma, 3 * sigma, color=ink, alpha=0.14, lw=0)
         axes.axhline(0.0, color="#9aa5b1", lw=0.8)
         axes.plot(at_s, error, dotted(len(at_s)), ms=3.5, lw=1.2, color=ink)
@@ -180,7 +182,7 @@ def _focus_errors(axes: Axes, shown: Sequence[tuple[int, DroneResult]], row: int
     for _, drone in shown:
         if drone.errors is None:
             continue
-        error, sigma = _error_and_sigma(drone.errors, row)
+        error, sigma = _error_and_sigma(drone.errors, drone.axes, row)
         highest.append(float(np.abs(error).max()))
         known = sigma[np.isfinite(sigma)]
         if len(known):
@@ -189,11 +191,13 @@ def _focus_errors(axes: Axes, shown: Sequence[tuple[int, DroneResult]], row: int
     axes.yaxis.set_major_locator(MaxNLocator(5, symmetric=True))
 
 
-def _error_and_sigma(errors: PoseErrors, row: int) -> tuple[Array, Array]:
+def _error_and_sigma(errors: PoseErrors, axes: ReferenceAxes, row: int) -> tuple[Array, Array]:
     """Return (T,) errors and sent sigmas: x, y, z in cm, then the heading in degrees."""
     if row == 3:
         return np.degrees(errors.yaw_rad), np.degrees(errors.yaw_sigma_rad)
-    return 100.0 * errors.position_ref_m[:, row], 100.0 * errors.position_sigma_ref_m[:, row]
+    error_m = along_axes(errors.position_ref_m, axes)
+    sigma_m = sigmas_along_axes(errors.position_sigma_ref_m, axes)
+    return 100.0 * error_m[:, row], 100.0 * sigma_m[:, row]
 
 
 def _mark_outcomes(axes: Axes, at_s: Array, outcomes: Sequence[str]) -> None:
@@ -213,5 +217,12 @@ def _time_limits(result: FlightResult) -> tuple[float, float]:
     return -0.03 * duration_s, 1.03 * duration_s
 
 
-def _label(axis: str, direction: str, aligned: bool) -> str:
-    return f"{axis}, {direction} [m]" if aligned else f"{axis} of world [m]"
+def _directions(result: FlightResult) -> tuple[str, str, str]:
+    """Return the labels of what is drawn to the east, to the north and upwards."""
+    if result.ref_from_world is None:
+        return "y of world [m]", "x of world [m]", "height, −z of world [m]"
+    axes = result.axes
+    if axes is None:
+        return "east [m]", "north [m]", "height [m]"
+    east, north, up = (axis_to(way, axes) for way in ("east", "north", "up"))
+    return f"{east}, east [m]", f"{north}, north [m]", f"height, {up} [m]"

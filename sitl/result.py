@@ -25,10 +25,11 @@ from sitl.lives import Life, Lives, read_lives, read_log
 from sitl.network_log import NetworkLog, read_network_log
 from sitl.plan import FlightPlan, PlannedDrone
 from sitl.processes import FlightError
+from sitl.recording_axes import axes_from_ned
 from vcl_companion.errors import WireError
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.recording import NED_FROM_REFERENCE
+from vcl_companion.recording import ReferenceAxes
 from vcl_companion.wire.map_codec import decode_map
 
 # A pose is about a frame: usec cuts its instant to a microsecond, and a clock
@@ -69,6 +70,7 @@ class DroneResult:
         given: (G,) which frames a living daemon was given.
         lives: of its daemon, in order.
         waits_for_map: whether the recording stands still, with its first frame, for the first map.
+        axes: of the recording's files, along which ``scores`` tell errors; all else is NED.
     """
 
     name: str
@@ -87,6 +89,7 @@ class DroneResult:
     given: NDArray[np.int64]
     lives: tuple[Life, ...]
     waits_for_map: bool
+    axes: ReferenceAxes
 
     @property
     def n_frames(self) -> int:
@@ -159,6 +162,12 @@ class FlightResult:
     points_ref_m: Array
     events: tuple[Event, ...]
     network: NetworkLog | None = None
+
+    @property
+    def axes(self) -> ReferenceAxes | None:
+        """Those of the recording's files; None where they are not the same for all drones."""
+        found = {drone.axes for drone in self.drones}
+        return found.pop() if len(found) == 1 else None
 
 
 def gather(plan: FlightPlan, out: Path, events: Iterable[Event] = ()) -> FlightResult:
@@ -243,7 +252,7 @@ def _drone_result(
     if alignment is not None:
         true = tuple(truth[n] if n >= 0 else None for n in frame_of.tolist())
         errors = pose_errors(estimates, true, alignment)
-    axes = NED_FROM_REFERENCE[planned.drone.sensor.reference_axes].T
+    axes = axes_from_ned(planned.drone.sensor.reference_axes)
     has_own_height = firmware is not None and firmware.has_own_height(
         flies_itself=planned.mission is not None
     )
@@ -273,6 +282,7 @@ def _drone_result(
         given=np.array(every if lives is None else lives.frames, dtype=np.int64),
         lives=() if lives is None else tuple(lives.lives),
         waits_for_map=waits_for_map,
+        axes=planned.drone.sensor.reference_axes,
     )
 
 

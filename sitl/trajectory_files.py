@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from sitl.evaluation import Estimates, upper_from_covariance
+from sitl.recording_axes import axes_from_ned
 from sitl.result import FlightResult
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.recording import NED_FROM_REFERENCE
 from vcl_companion.recording.tum import write_tum
 
 
@@ -20,18 +20,17 @@ def write_trajectories(result: FlightResult, out: Path) -> None:
     ``world`` by the leader's start; without a truth to do so they stay in
     ``world``. Covariances go out as they were sent, in the axes of ``world``.
     """
-    for planned, drone in zip(result.plan.drones, result.drones, strict=True):
-        axes = planned.drone.sensor.reference_axes
-        axes_from_ned = Pose(NED_FROM_REFERENCE[axes].T, np.zeros(3))
+    for drone in result.drones:
+        turned = Pose(axes_from_ned(drone.axes), np.zeros(3))
         carry = Pose.identity()
         if result.ref_from_world is not None:
-            carry = axes_from_ned @ result.ref_from_world
+            carry = turned @ result.ref_from_world
         at_ns = drone.estimates.at_ns.tolist()
         poses = (carry @ pose for pose in drone.estimates.world_from_body)
         write_tum(out / drone.name / "estimate.tum", zip(at_ns, poses, strict=True))
         _write_covariances(out / drone.name / "covariance.csv", drone.estimates)
         known = [
-            (at_ns, axes_from_ned @ pose)
+            (at_ns, turned @ pose)
             for at_ns, pose in zip(drone.frames_at_ns.tolist(), drone.truth, strict=True)
             if pose is not None
         ]

@@ -8,14 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 
+from sitl import report_plots
 from sitl.network import Fate
 from sitl.network_log import NetworkLog
 from sitl.network_report import message_rows
 from sitl.partitions import parse_partition
 from sitl.peer_traffic import Traffic
 from sitl.processes import FlightError
+from sitl.recording_axes import sigmas_along_axes
 from sitl.reliance import RELIANCES
 from sitl.report import report_of, write_report
 from sitl.result import FlightResult, gather
@@ -32,7 +35,7 @@ from tests.sitl.flights import (
     ned_from_body,
 )
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.recording import NED_FROM_REFERENCE, read_recording
+from vcl_companion.recording import NED_FROM_REFERENCE, ReferenceAxes, read_recording
 from vcl_companion.recording.tum import read_tum
 
 
@@ -363,6 +366,82 @@ def test_poses_go_out_in_the_recording_s_own_axes(tmp_path: Path) -> None:
         truth = ned_from_body(1, 7)
         assert pose.translation == pytest.approx(enu_from_ned @ truth.translation, abs=1e-6)
         assert np.allclose(pose.rotation, enu_from_ned @ truth.rotation, atol=1e-6)
+
+
+def figures_of(result: FlightResult, monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """Draw trajectories and errors, and return the figures."""
+    drawn: list[Figure] = []
+
+    def keep(figure: Figure, _: str) -> str:
+        drawn.append(figure)
+        return ""
+
+    monkeypatch.setattr(report_plots, "svg", keep)
+    report_plots.trajectories_svg(result)
+    report_plots.errors_svg(result)
+    return drawn
+
+
+@pytest.mark.parametrize(
+    ("kind", "names", "from_above", "height"),
+    [
+        ("NED", ("x, north", "y, east", "z, down"), ("y, east", "x, north"), "height, −z"),
+        ("ENU", ("x, east", "y, north", "z, up"), ("x, east", "y, north"), "height, z"),
+        ("NWU", ("x, north", "y, west", "z, up"), ("−y, east", "x, north"), "height, z"),
+    ],
+)
+def test_pictures_are_in_the_axes_that_errors_are_told_along(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kind: ReferenceAxes,
+    names: tuple[str, str, str],
+    from_above: tuple[str, str],
+    height: str,
+) -> None:
+    off_m = np.array([0.01, 0.03, 0.07])
+
+    def error(drone: str, k: int) -> Array:
+        along_world = NED_FROM_WORLD.rotation.T @ off_m
+        return np.concatenate(
+            [along_world if (drone, k) != ("mav0", 0) else 0 * off_m, np.zeros(3)]
+        )
+
+    result, report, _ = reported(tmp_path, Flight(axes=kind, error=error))
+    trajectories, errors = figures_of(result, monkeypatch)
+    above, side = trajectories.axes
+    assert (above.get_xlabel(), above.get_ylabel()) == tuple(f"{name} [m]" for name in from_above)
+    assert (side.get_xlabel(), side.get_ylabel()) == (f"{from_above[1]} [m]", f"{height} [m]")
+    drone = report["drones"]["mav1"]
+    assert drone["axes"] == kind
+    # Columns are drones: the second one's, without the yaw.
+    for axes, name, letter in zip(errors.axes[1:6:2], names, "xyz", strict=True):
+        (_, line, *_) = axes.lines
+        drawn_m = 0.01 * np.array(line.get_ydata())
+        assert np.sqrt(np.mean(drawn_m**2)) == pytest.approx(drone["rmse_m"][letter], abs=1e-6)
+        row = names.index(name)
+        assert errors.axes[2 * row].get_ylabel() == f"{name} [cm]"
+    signed = NED_FROM_REFERENCE[kind].T @ off_m
+    assert [np.array(axes.lines[1].get_ydata())[5] for axes in errors.axes[1:6:2]] == pytest.approx(
+        100.0 * signed, abs=1e-6
+    )
+
+
+def test_a_sigma_along_an_axis_is_one_whichever_way_that_points() -> None:
+    along_ned = np.array([[1.0, 2.0, 3.0]])
+    assert sigmas_along_axes(along_ned, "ENU").tolist() == [[2.0, 1.0, 3.0]]
+    assert sigmas_along_axes(along_ned, "NWU").tolist() == [[1.0, 2.0, 3.0]]
+
+
+def test_drones_of_several_axes_are_each_in_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result, _, _ = reported(tmp_path, Flight())
+    first, second = result.drones
+    mixed = replace(result, drones=(first, replace(second, axes="ENU")))
+    trajectories, errors = figures_of(mixed, monkeypatch)
+    assert trajectories.axes[0].get_xlabel() == "east [m]"
+    assert [axes.get_title(loc="left") for axes in errors.axes[:2]] == ["mav0 (NED)", "mav1 (ENU)"]
+    assert errors.axes[0].get_ylabel() == "x [cm]"
 
 
 def test_without_truth_estimates_stay_in_world_and_errors_are_unknown(tmp_path: Path) -> None:
