@@ -14,11 +14,16 @@ import numpy as np
 
 from sitl.evaluation import Estimates, covariance_from_upper
 from sitl.processes import FlightError
+from vcl_companion.errors import reason_of
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import matrix_from_euler
 
 COMPANION_COMPONENT = 197
 _Row = TypeVar("_Row", bound=msgspec.Struct)
+# What int64 holds: arrays are made of them.
+_Ns = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
+_Sequence = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+_Us = Annotated[int, msgspec.Meta(ge=0, le=(2**63 - 1) // 1000)]
 
 
 class FrameRow(msgspec.Struct, frozen=True):
@@ -29,8 +34,8 @@ class FrameRow(msgspec.Struct, frozen=True):
     was: a localized frame then has the ``reason`` why the autopilot did not need it.
     """
 
-    sequence: int
-    captured_at_ns: int
+    sequence: _Sequence
+    captured_at_ns: _Ns
     outcome: Literal["localized", "refused", "dropped"]
     reason: str | None = None
     latency_ms: float | None = None
@@ -48,7 +53,7 @@ class FrameRow(msgspec.Struct, frozen=True):
 class PropagatedRow(msgspec.Struct, frozen=True):
     """A pose between frames that the autopilot was sent, and how long after the last fix."""
 
-    at_ns: int
+    at_ns: _Ns
     since_fix_s: float
 
 
@@ -58,7 +63,7 @@ class EstimateRow(msgspec.Struct, frozen=True):
     ``covariance`` is the upper triangle of (6, 6) as in VISION_POSITION_ESTIMATE.
     """
 
-    captured_at_ns: int
+    captured_at_ns: _Ns
     source: Literal["intra", "inter"]
     position: tuple[float, float, float]
     quaternion: tuple[float, float, float, float]
@@ -71,7 +76,7 @@ class EstimateRow(msgspec.Struct, frozen=True):
 class EventRow(msgspec.Struct, frozen=True):
     """Something that happened aboard."""
 
-    at_ns: int
+    at_ns: _Ns
     event: str
     reason: str | None = None
 
@@ -79,7 +84,7 @@ class EventRow(msgspec.Struct, frozen=True):
 class MapRow(msgspec.Struct, frozen=True):
     """A revision of the shared map that came into use."""
 
-    at_ns: int
+    at_ns: _Ns
     revision: str
     landmarks: int
     bytes: int
@@ -94,7 +99,7 @@ class ClockRow(msgspec.Struct, frozen=True):
     further off than the bounds.
     """
 
-    at_ns: int
+    at_ns: _Ns
     peer: int
     offset_ns: int
     bound_ns: int
@@ -218,7 +223,7 @@ def estimates_of(rows: Iterable[EstimateRow]) -> Estimates:
 
 
 class _VisionPosition(msgspec.Struct, frozen=True):
-    usec: int
+    usec: _Us
     x: float
     y: float
     z: float
@@ -266,8 +271,8 @@ def _json_lines(path: Path, *, cut_off: bool = False) -> Iterator[tuple[int, dic
     """Yield (row, object) of a file of JSON lines; rows count from 1."""
     try:
         lines = path.read_text(encoding="utf-8").split("\n")
-    except OSError as error:
-        raise FlightError(f"{path}: {error.strerror}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise FlightError(f"{path}: {reason_of(error)}") from error
     if cut_off:
         del lines[-1]  # what follows the last line break
     for row, line in enumerate(lines, start=1):

@@ -16,7 +16,7 @@ import numpy as np
 
 from sitl.absences import seconds_late
 from sitl.daemon_config import check_settings
-from sitl.out_folder import prepare_folder
+from sitl.out_folder import files_in_one_line, prepare_folder
 from sitl.pacing import Instant, Pace, gate, instants
 from sitl.plan import FlightPlan, FlyOptions, plan_flight
 from sitl.processes import FlightError, unless_one_ends
@@ -80,22 +80,28 @@ def flown(plan: FlightPlan, out: Path, shots: Shots, progress: Progress) -> Cond
     """
     # Daemons that start together would all compile the same.
     progress("compiling, once on this machine", 0, 0)
-    warm_up()
-    return asyncio.run(_flown(plan, out, shots, progress))
+    with files_in_one_line():
+        warm_up()
+        return asyncio.run(_flown(plan, out, shots, progress))
 
 
 def reported(plan: FlightPlan, out: Path, conduct: Conduct, progress: Progress) -> dict[str, Any]:
-    """Compare a flight with the truth, write its report, and return what report.json says."""
+    """Compare a flight with the truth, write its report, and return what report.json says.
+
+    Raises:
+        FlightError: a file is missing or broken, or cannot be written.
+    """
     progress("writing the report", 0, 0)
-    result = gather(plan, out, conduct.events)
-    write_trajectories(result, out)
-    return write_report(
-        result,
-        out,
-        start_s=conduct.start_s,
-        flight_s=conduct.flight_s,
-        late_ms=float(np.percentile(conduct.late_ms, 99.0)) if conduct.late_ms else None,
-    )
+    with files_in_one_line():
+        result = gather(plan, out, conduct.events)
+        write_trajectories(result, out)
+        return write_report(
+            result,
+            out,
+            start_s=conduct.start_s,
+            flight_s=conduct.flight_s,
+            late_ms=float(np.percentile(conduct.late_ms, 99.0)) if conduct.late_ms else None,
+        )
 
 
 async def _flown(plan: FlightPlan, out: Path, shots: Shots, progress: Progress) -> Conduct:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from sitl.fused import FUSED_FILE, SAID_FILE
 from sitl.mission import COMMANDED_FILE
 from sitl.plan import FlightPlan
-from vcl_companion.errors import ConfigError
+from sitl.processes import FlightError
+from vcl_companion.errors import ConfigError, reason_of
 
 RECORDING_FOLDER = "recording"
 """What a live flight has recorded."""
@@ -22,6 +25,20 @@ _OWN_FILES = (
 )
 _OWN_REPORTS = ("report.json", "report.html")
 _OWN_FOLDERS = ("run", RECORDING_FOLDER)
+
+
+@contextmanager
+def files_in_one_line() -> Iterator[None]:
+    """Say what is wrong with a file of a flight in one line: a full disk, an image that is gone.
+
+    Raises:
+        FlightError: instead of any OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        which = f"{error.filename}: " if error.filename else ""
+        raise FlightError(f"{which}{reason_of(error) or type(error).__name__}") from error
 
 
 def prepare_folder(out: Path, plan: FlightPlan) -> None:

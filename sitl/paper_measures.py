@@ -51,7 +51,7 @@ def drone_measures(
     by_source = {row.sequence: row for row in drone.log.frames}
     return {
         "frames": drone.n_frames,
-        "localized_share": drone.n_localized / drone.n_frames,
+        "localized_share": drone.n_localized / max(drone.n_frames, 1),
         "frames_refused": drone.log.count("refused"),
         "frames_dropped": drone.log.count("dropped"),
         "unaccounted": drone.unaccounted,

@@ -150,7 +150,7 @@ def _tiles(report: Mapping[str, Any]) -> str:
     p99s = [d["latency_ms"]["p99"] for d in drones if d["latency_ms"]["p99"] is not None]
     unaccounted = sum(drone["unaccounted"] for drone in drones)
     tiles = [
-        (f"{100.0 * localized / frames:.1f} %", "of frames localized", False),
+        (f"{100.0 * localized / frames:.1f} %" if frames else "—", "of frames localized", False),
         (f"{100.0 * max(ates):.1f} cm" if ates else "—", "worst drone's ATE", False),
         (f"{max(p99s):.0f} ms" if p99s else "—", "p99 latency", False),
         (f"{report['map']['landmarks']}", f"landmarks, {report['map']['bytes'] / 1e3:.0f} kB map",

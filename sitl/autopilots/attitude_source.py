@@ -136,6 +136,8 @@ def read_table(path: Path, n_columns: int) -> tuple[NDArray[np.int64], Array]:
             raise ConfigError(f"{path}, row {number}: expected {n_columns} finite numbers")
         if abs(float(np.linalg.norm(row[-4:])) - 1.0) > 1e-3:
             raise ConfigError(f"{path}, row {number}: not a unit quaternion")
+        if not 0 <= at_ns < 2**63:
+            raise ConfigError(f"{path}, row {number}: {at_ns} is no time in nanoseconds")
         if times and at_ns <= times[-1]:
             raise ConfigError(f"{path}, row {number}: time does not rise")
         times.append(at_ns)

@@ -12,6 +12,9 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from sitl import report_plots
+from sitl.fly import Conduct
+from sitl.fly import reported as conclude
+from sitl.lives import Life, Lives, write_lives
 from sitl.network import Fate
 from sitl.network_log import NetworkLog
 from sitl.network_report import message_rows
@@ -37,6 +40,8 @@ from tests.sitl.flights import (
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.recording import NED_FROM_REFERENCE, ReferenceAxes, read_recording
 from vcl_companion.recording.tum import read_tum
+
+EVERY_FRAME = frozenset((f"mav{n}", k) for n in range(2) for k in range(12))
 
 
 def reported(tmp_path: Path, flight: Flight) -> tuple[FlightResult, dict[str, Any], Path]:
@@ -535,6 +540,10 @@ def test_a_localized_frame_that_was_held_back_is_no_pose_that_got_lost(tmp_path:
     ("damage", "message"),
     [
         ('{"kind":"frame","sequence":"one"}', r"flight\.jsonl, row 1: .*int"),
+        (
+            f'{{"kind":"frame","sequence":0,"captured_at_ns":{2**63},"outcome":"refused"}}',
+            r"flight\.jsonl, row 1: .*<= 9223372036854775807",
+        ),
         ('{"kind":"frame"', r"flight\.jsonl, row 1: not JSON"),
         ("[1]", r"flight\.jsonl, row 1: not a JSON object"),
     ],
@@ -626,6 +635,30 @@ def test_the_page_of_a_flight_that_never_had_a_map(tmp_path: Path) -> None:
         "keyframes": 0,
     }
     assert len(result.points_ref_m) == 0
+
+
+def test_a_log_that_is_no_text_is_one_line(tmp_path: Path) -> None:
+    plan, out = leave_behind(tmp_path, Flight())
+    (out / "mav1" / "received.jsonl").write_bytes(b"\xff\xfe{}\n")
+    with pytest.raises(FlightError, match=r"received\.jsonl: .*invalid start byte"):
+        gather(plan, out)
+
+
+def test_a_report_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    plan, out = leave_behind(tmp_path, Flight())
+    (out / "report.json").mkdir()
+    with pytest.raises(FlightError, match=r"report\.json: Is a directory$"):
+        conclude(plan, out, Conduct(), lambda *_: None)
+
+
+def test_a_flight_without_a_frame_has_a_report(tmp_path: Path) -> None:
+    """All daemons were killed with their first frames in hand."""
+    plan, out = leave_behind(tmp_path, Flight(unlogged=EVERY_FRAME, refused=EVERY_FRAME))
+    begins_ns = plan.starts_at_ns
+    write_lives(out, {d.name: Lives([Life(begins_ns, begins_ns)], ()) for d in plan.drones})
+    result = gather(plan, out)
+    assert [drone.n_frames for drone in result.drones] == [0, 0]
+    assert "<b>—</b><span>of frames localized" in page_of(result, out)
 
 
 def test_map_points_are_carried_into_the_recording_s_frame(tmp_path: Path) -> None:

@@ -386,7 +386,8 @@ def test_a_wrong_configuration_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("row", "why"),
     [("1,0,0,0,1,0,0", "8 finite"), ("1,0,0,0,1,0,0,x", "could not"), ("1,0,0,0,nan,0,0,0", "8"),
-     ("1,0,0,0,2,0,0,0", "unit"), ("0,0,0,0,1,0,0,0", "rise")],
+     ("1,0,0,0,2,0,0,0", "unit"), ("0,0,0,0,1,0,0,0", "rise"),
+     ("9223372036854775808,0,0,0,1,0,0,0", "no time in nanoseconds")],
 )  # fmt: skip
 def test_a_broken_trajectory_names_its_row(tmp_path: Path, row: str, why: str) -> None:
     path = tmp_path / "truth.csv"
