@@ -129,13 +129,15 @@ def _draw_flight(axes: Axes, result: FlightResult, across: int, up: int, up_sign
             points[:, across], up_sign * points[:, up], ".", ms=2.0, color=POINT, alpha=0.8,
             label="map points", zorder=1, rasterized=True,
         )  # fmt: skip
+    is_named = False  # in the legend, once: the first drone need not have a truth
     for n, drone in enumerate(result.drones):
         true = np.array([pose.translation for pose in drone.truth if pose is not None])
         if len(true) and result.ref_from_world is not None:
             axes.plot(
                 true[:, across], up_sign * true[:, up], color=INK, lw=1.0, dashes=(4, 2),
-                label="truth" if n == 0 else None, zorder=3,
+                label=None if is_named else "truth", zorder=3,
             )  # fmt: skip
+            is_named = True
         estimated = _estimated_ref_m(result, drone)
         if len(estimated):
             axes.plot(

@@ -47,8 +47,8 @@ def sitl_fly(*arguments: object) -> subprocess.CompletedProcess[str]:
     )
 
 
-def start_of_demo(path: Path) -> Path:
-    """Write the first frames of the demo as a recording of its own."""
+def start_of_demo(path: Path, frames: dict[str, slice] | None = None) -> Path:
+    """Write the first frames of the demo, or some of each drone, as a recording of its own."""
     demo = read_recording(DEMO)
     description = Description(
         "start of demo",
@@ -61,7 +61,7 @@ def start_of_demo(path: Path) -> Path:
     with RecordingWriter(path, description) as writer:
         for drone in demo.drones:
             writer.add_drone(drone.name, drone.sensor, drone.truth)
-            for frame in drone.frames[:N_FRAMES]:
+            for frame in drone.frames[frames[drone.name] if frames else slice(N_FRAMES)]:
                 writer.add_file(drone.name, frame.at_ns, frame.path)
     return path
 
@@ -212,6 +212,34 @@ def test_a_camera_that_dies_ends_in_silence_and_its_return_in_poses(tmp_path: Pa
     # Between frames, and half a second beyond the last one.
     assert told_s[told_s < 4.0].max() == pytest.approx(0.8 + 0.5, abs=0.01)
     assert told_s[told_s > 1.4].min() == pytest.approx(4.0, abs=0.01)
+
+
+def test_drones_that_begin_apart_fly_from_where_they_are_together(tmp_path: Path) -> None:
+    """mav1, whose distance is known, comes 1.4 s after the others; one image of mav2 is damaged."""
+    frames = {"mav0": slice(11), "mav1": slice(7, 11), "mav2": slice(11)}
+    path = start_of_demo(tmp_path / "apart", frames)
+    drone = read_recording(path).drone("mav2")
+    height, width = drone.sensor.camera.height_px, drone.sensor.camera.width_px
+    size = height.to_bytes(2, "big") + width.to_bytes(2, "big")
+    # A header, the end marker, and nothing between them.
+    drone.frames[9].path.write_bytes(
+        b"\xff\xd8\xff\xc0\x00\x0b\x08" + size + b"\x01\x01\x11\x00\xff\xd9"
+    )
+    out = tmp_path / "out"
+    done = sitl_fly(path, "--out", out, "--speed", "max")
+    assert done.returncode == 0, done.stderr
+    report = report_in(out)
+    assert report["duration_s"] == pytest.approx(0.6)
+    for name, drone_report in report["drones"].items():
+        damaged = int(name == "mav2")
+        assert drone_report["frames"] == 4
+        assert drone_report["frames_localized"] == 4 - damaged
+        assert drone_report["refusals"] == ({"undecodable image": 1} if damaged else {})
+        assert drone_report["unaccounted"] == 0
+        assert drone_report["ate_m"] < 0.05
+    told = {e["drone"]: e["reason"] for e in report["events"] if e["kind"] == "harness"}
+    assert told.keys() == {"mav0", "mav2"}
+    assert all(reason.startswith("7 frames not flown") for reason in told.values())
 
 
 def test_nothing_of_the_truth_reaches_a_daemon(

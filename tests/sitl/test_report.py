@@ -437,6 +437,19 @@ def test_a_sigma_along_an_axis_is_one_whichever_way_that_points() -> None:
     assert sigmas_along_axes(along_ned, "NWU").tolist() == [[1.0, 2.0, 3.0]]
 
 
+def test_the_legend_names_the_truth_whoever_has_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result, _, _ = reported(tmp_path, Flight())
+    first, second = result.drones
+    without = replace(first, truth=(None,) * len(first.truth), errors=None)
+    for drones in ((first, second), (without, second)):
+        trajectories, _ = figures_of(replace(result, drones=drones), monkeypatch)
+        (legend,) = trajectories.legends
+        names = [text.get_text() for text in legend.get_texts()]
+        assert sorted(names) == ["map points", "mav0", "mav1", "truth"]
+
+
 def test_drones_of_several_axes_are_each_in_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
