@@ -4,7 +4,8 @@ A daemon makes it of its own newest frame and of those that the others took with
 So the leader has to be there, and two whose distance is known; who begins within a second of them
 is waited for as well, whoever begins later joins a map that there is by then. Frames from before
 are of a time in which nobody could be localized, and a round of them would end without a map, or
-with one of another moment than the distance is of: but for each drone's newest they are left out.
+with one of another moment than the distance is of: but for each drone's newest they are left out,
+and that too where it is too old.
 """
 
 from __future__ import annotations
@@ -60,16 +61,33 @@ def beginning(drones: Sequence[Drone], leader: str, pairs: Sequence[KnownPair]) 
     at_ns, who = min(possible, key=lambda one: one[0])
     latest_ns = at_ns + FURTHEST_NS
     soon = [int(t[0]) for t in times.values() if t[0] <= latest_ns]
-    # By then those who are needed may be further apart; then nobody else is waited for.
     with_them_ns = _together_ns(times, who, origin, max(at_ns, *soon))
-    if with_them_ns is not None and with_them_ns <= latest_ns:
+    # Where the leader pauses until then its frame is too old for theirs: nobody else is waited for.
+    if (
+        with_them_ns is not None
+        and with_them_ns <= latest_ns
+        and with_them_ns - _newest_ns(times[origin], with_them_ns) <= FURTHEST_NS
+    ):
         at_ns = with_them_ns
-    return Beginning(at_ns, frozenset(name for name, t in times.items() if t[0] <= at_ns))
+    origin_ns = _newest_ns(times[origin], at_ns)
+    there = {name: _newest_ns(t, at_ns) for name, t in times.items() if t[0] <= at_ns}
+    near = (name for name, ns in there.items() if abs(ns - origin_ns) <= FURTHEST_NS)
+    return Beginning(at_ns, frozenset(near))
 
 
-def n_before(drone: Drone, at_ns: int) -> int:
-    """Return how many of a drone's frames are older than its newest one of an instant."""
-    return max(0, int(np.searchsorted(instants_of(drone), at_ns, side="right")) - 1)
+def n_before(drone: Drone, begins: Beginning, *, is_late: bool) -> int:
+    """Return how many of a drone's frames are left out: one is always flown.
+
+    Args:
+        drone: whose frames.
+        begins: when the recording waits for the first map.
+        is_late: whether the drone's daemon comes later, and is given what there is then.
+    """
+    n_come = int(np.searchsorted(instants_of(drone), begins.at_ns, side="right"))
+    if drone.name in begins.drones or is_late:
+        return max(n_come - 1, 0)
+    # Who pauses then is one who begins later.
+    return min(n_come, len(drone.frames) - 1)
 
 
 def instants_of(drone: Drone) -> NDArray[np.int64]:
@@ -91,3 +109,7 @@ def _newest(times: NDArray[np.int64], instants: NDArray[np.int64]) -> NDArray[np
     """Return the last of a drone's instants up to each of others, none before its first."""
     newest: NDArray[np.int64] = times[np.searchsorted(times, instants, side="right") - 1]
     return newest
+
+
+def _newest_ns(times: NDArray[np.int64], at_ns: int) -> int:
+    return int(_newest(times, np.array([at_ns]))[0])

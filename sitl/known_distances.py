@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sitl.first_map import n_before
+from sitl.first_map import instants_of
 from vcl_companion.errors import ConfigError
 from vcl_companion.recording import Drone, KnownPair, Recording
 
@@ -103,10 +103,11 @@ def known_distances(
 
 
 def _true_distance_m(a: Drone, b: Drone, at_ns: int) -> float | None:
-    """Return how far two drones are apart at their newest frames of then, by the truth."""
+    """Return how far two drones, both there, are apart at their newest frames of then, by truth."""
     starts = []
     for drone in (a, b):
-        newest_ns = drone.frames[n_before(drone, at_ns)].at_ns
+        n_come = int(np.searchsorted(instants_of(drone), at_ns, side="right"))
+        newest_ns = drone.frames[n_come - 1].at_ns
         start = drone.truth.pose_at(newest_ns) if drone.truth else None
         if start is None:
             return None

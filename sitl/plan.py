@@ -207,7 +207,7 @@ def plan_flight(recording: Recording, options: FlyOptions) -> FlightPlan:
     # That nobody is there is said below, where it is known how long the flight is.
     there = [drone for drone in recorded if drone.name not in late] or recorded
     begins = beginning(there, leader, pairs)
-    left_out = {drone.name: n_before(drone, begins.at_ns) for drone in recorded}
+    left_out = {d.name: n_before(d, begins, is_late=d.name in late) for d in recorded}
     flown = [replace(drone, frames=drone.frames[left_out[drone.name] :]) for drone in recorded]
     ids = {name: n + 1 for n, name in enumerate(names)}
     plan = FlightPlan(

@@ -11,7 +11,7 @@ from sitl.pacing import gate, instants
 from sitl.plan import FlightPlan, FlyOptions, plan_flight
 from tests.sitl.flights import Flight, at_ns, ned_from_body, write_recording
 from vcl_companion.errors import ConfigError
-from vcl_companion.recording import KnownPair, Recording, read_recording
+from vcl_companion.recording import Drone, KnownPair, Recording, read_recording
 
 N_FRAMES = 30  # five a second: of six seconds
 OF_TRUTH = (KnownPair("mav0", "mav1"),)
@@ -96,12 +96,50 @@ def test_the_pair_that_is_there_first_gives_the_scale(recording: Recording) -> N
 
 def test_a_pair_that_pauses_is_waited_for_until_it_is_together(recording: Recording) -> None:
     """mav1's first frame lies in a pause of the leader's."""
-    first, last = recording.drones[0].frames[:3], recording.drones[0].frames[20:]
-    paused = replace(recording.drones[0], frames=(*first, *last))
+    paused = pausing(recording, 0, 3, 20)
     drones = (paused, replace(recording.drones[1], frames=recording.drones[1].frames[10:]))
     plan = plan_flight(replace(recording, drones=drones), FlyOptions(known_distances=OF_TRUTH))
     assert left_out(plan) == {"mav0": 3, "mav1": 9}
     assert plan.known_distances[0][2] == pytest.approx(apart_m(0, 20, 1, 19), abs=1e-9)
+
+
+def pausing(recording: Recording, who: int, until: int, again: int) -> Drone:
+    """Return a drone without its frames of some time."""
+    drone = recording.drones[who]
+    return replace(drone, frames=(*drone.frames[:until], *drone.frames[again:]))
+
+
+def test_who_pauses_while_the_map_is_made_begins_later(recording: Recording) -> None:
+    one, other, third = recording.drones
+    begins = (one, replace(other, frames=other.frames[10:]), pausing(recording, 2, 3, 20))
+    plan = plan_flight(replace(recording, drones=begins), FlyOptions(known_distances=OF_TRUTH))
+    assert plan.waited_for == {"mav0", "mav1"}
+    assert left_out(plan) == {"mav0": 10, "mav2": 3}
+    assert plan.starts_at_ns == at_ns(0, 10)
+    # Of who has no more to come the last one is flown.
+    begins = (*begins[:2], replace(third, frames=third.frames[:3]))
+    plan = plan_flight(replace(recording, drones=begins), FlyOptions(known_distances=OF_TRUTH))
+    assert plan.waited_for == {"mav0", "mav1"}
+    assert left_out(plan) == {"mav0": 10, "mav2": 2}
+
+
+def test_nobody_is_waited_for_whom_the_leader_s_frame_is_too_old_for(recording: Recording) -> None:
+    begins = (
+        pausing(recording, 0, 1, 20),
+        replace(recording.drones[1], frames=recording.drones[1].frames[4:]),
+        replace(recording.drones[2], frames=recording.drones[2].frames[8:]),
+    )
+    plan = plan_flight(replace(recording, drones=begins), FlyOptions(known_distances=OF_TRUTH))
+    assert plan.waited_for == {"mav0", "mav1"}
+    assert left_out(plan) == {}
+    assert plan.known_distances[0][2] == pytest.approx(apart_m(0, 0, 1, 4), abs=1e-9)
+
+
+def test_who_is_late_is_given_what_there_is_then(recording: Recording) -> None:
+    late = FlyOptions(known_distances=OF_TRUTH, absences=(Absence("mav2", 0.0, 3.0),))
+    plan = plan_flight(recording, late)
+    assert plan.waited_for == {"mav0", "mav1"}
+    assert left_out(plan) == {}
 
 
 def test_drones_that_are_never_together_are_one_line(recording: Recording) -> None:
