@@ -270,6 +270,48 @@ def test_attitude_that_comes_and_goes_is_taken_while_it_is_there() -> None:
     assert_consistent(errors, sigma, slack=1.1)
 
 
+@pytest.mark.parametrize("lost_s", [1.0, 2.0, 5.0, 10.0])
+@pytest.mark.parametrize("per_s", [5, 30])
+def test_who_has_stopped_while_lost_is_not_told_to_fly_on(lost_s: float, per_s: int) -> None:
+    """What is unknown of the motion was one thing then, and is another by now."""
+    options, step_ns = FilterOptions(), 1_000_000_000 // per_s
+
+    def place(at_s: float) -> Pose:
+        """At 3 m/s, until it brakes to a stop within a second."""
+        braking_s = min(max(at_s, 0.0), 1.0)
+        return Pose(
+            np.eye(3), np.array([3.0 * (min(at_s, 0.0) + braking_s - 0.5 * braking_s**2), 0, 0])
+        )
+
+    state = started(fix_at(place(-2.0)), -2_000_000_000, np.eye(3), options)
+    while state.at_ns + step_ns <= 0:
+        there = predict(state, state.at_ns + step_ns, np.eye(3), options)
+        state = updated(there, fix_at(place((state.at_ns + step_ns) * 1e-9)))
+    found_at_ns = state.at_ns + round(lost_s * per_s) * step_ns
+    for at_ns in (found_at_ns, found_at_ns + step_ns):
+        state = updated(predict(state, at_ns, np.eye(3), options), fix_at(place(at_ns * 1e-9)))
+        speed_m_s, sigma_m_s = state.velocity_world[0], np.sqrt(state.velocity_covariance()[0, 0])
+        assert abs(speed_m_s) < 3.5 * sigma_m_s
+        assert state.n_jumps == 0
+
+
+def test_an_attitude_that_is_missing_once_leaves_unknown_what_was_turned_meanwhile() -> None:
+    """However long ago the last fix was: the attitude has told of all turns up to there."""
+    options, step_ns = FilterOptions(), 33_000_000
+    start = started(fix_at(Pose.identity()), 0, np.eye(3), options)
+    for lost in (15, 150):
+        state: FilterState | None = start
+        for k in range(1, lost + 1):
+            assert state is not None
+            attitude = None if k == lost - 1 else np.eye(3)
+            state = predict(state, k * step_ns, attitude, options)
+        assert state is not None
+        sigma_deg = np.rad2deg(np.sqrt(np.diag(state.pose_covariance())[3:]))
+        unknown_deg = options.turn_rate_deg_s * 2 * step_ns * 1e-9
+        assert (unknown_deg < sigma_deg).all()
+        assert (sigma_deg < unknown_deg + 0.6).all()
+
+
 def test_a_prediction_of_the_past_stays_where_it_is() -> None:
     state = replace(settled(np.eye(3)), velocity_world=np.array([1.0, 2.0, 3.0]))
     past = predict(state, state.at_ns - 5 * STEP_NS, np.eye(3), FilterOptions())

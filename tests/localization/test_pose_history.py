@@ -138,6 +138,27 @@ def test_a_late_proposal_is_worth_as_much_as_one_in_time() -> None:
     np.testing.assert_allclose(fused.covariance, newest(in_time).covariance, atol=1e-12)
 
 
+def test_what_a_peer_has_said_stays_when_something_older_comes() -> None:
+    """Another's word about an earlier frame, or that frame's own fix, found late."""
+    history, _ = flown(np.random.default_rng(5), 4)
+    for k in range(4, 12):
+        predicted = predict(newest(history), k * FRAME_NS, truth_at(k).rotation, OPTIONS)
+        assert predicted is not None
+        history.append(predicted, None, truth_at(k).rotation)
+    assert isinstance(history.fuse(10 * FRAME_NS, truth_at(10), sharp(0.05), ARM_M), FilterState)
+
+    def sigma_m() -> float:
+        return float(np.sqrt(np.trace(newest(history).pose_covariance()[:3, :3])))
+
+    told_m = sigma_m()
+    assert isinstance(history.fuse(5 * FRAME_NS, truth_at(5), sharp(0.05), ARM_M), FilterState)
+    assert sigma_m() < 1.01 * told_m
+    assert newest(history).fixed_at_ns == 10 * FRAME_NS
+    assert isinstance(history.refit(6 * FRAME_NS, fix_at(truth_at(6))), FilterState)
+    assert sigma_m() < 1.01 * told_m
+    assert newest(history).fixed_at_ns == 10 * FRAME_NS
+
+
 def test_a_late_fix_is_worth_as_much_as_one_in_time() -> None:
     """Of a frame that was looked for by its features while others were tracked."""
     in_time, fixes = flown(np.random.default_rng(3), 8)

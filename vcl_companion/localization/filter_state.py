@@ -69,6 +69,8 @@ class FilterState:
         fixed_at_ns: instant of the last fix.
         n_jumps: how often the estimate moved by more than its covariance explains.
         fixed_attitude: (3, 3) the attitude sample of the last fix, or None.
+        turned_from_ns: instant of the last fix or attitude sample: how far the drone has turned
+            is known up to there.
     """
 
     at_ns: int
@@ -81,6 +83,7 @@ class FilterState:
     fixed_at_ns: int
     n_jumps: int
     fixed_attitude: Array | None = None
+    turned_from_ns: int = 0
 
     def pose_covariance(self) -> Array:
         """Return (6, 6) covariance of the pose, local perturbation, the map's error in it."""
@@ -130,7 +133,12 @@ class FilterState:
 
     def fixed(self) -> FilterState:
         """Return the state as one that has just been fixed."""
-        return replace(self, fixed_at_ns=self.at_ns, fixed_attitude=self.ned_from_body)
+        return replace(
+            self,
+            fixed_at_ns=self.at_ns,
+            fixed_attitude=self.ned_from_body,
+            turned_from_ns=self.at_ns,
+        )
 
     def corrected(self, step: Array, covariance: Array, own_map_covariance: Array) -> FilterState:
         """Return the state as one that has just been fixed, moved by an error state.
@@ -210,9 +218,17 @@ def kalman_step(covariance: Array, measured: Measurement) -> tuple[Array, Array]
         (12 + 6V,) step of the error state, and its covariance after, symmetric but for rounding.
     """
     observation = measured.observation
-    gain = np.linalg.solve(measured.expected_by(covariance), observation @ covariance).T
-    gain[N_OWN:] = 0.0  # considered, not estimated
+    seen = observation @ covariance
+    # Of the keyframes nothing is estimated, they are considered: their rows of the gain are zero.
+    gain = np.linalg.solve(measured.expected_by(covariance), seen).T[:N_OWN]
     # Joseph's form holds for any gain, so for a considered state too.
-    keep = np.eye(len(covariance)) - gain @ observation
-    left = keep @ covariance @ keep.T + gain @ measured.noise @ gain.T
-    return gain @ measured.innovation, left
+    kept = covariance[:N_OWN] - gain @ seen
+    left = covariance.copy()
+    left[:N_OWN, N_OWN:] = kept[:, N_OWN:]
+    left[N_OWN:, :N_OWN] = kept[:, N_OWN:].T
+    left[:N_OWN, :N_OWN] = (
+        kept[:, :N_OWN] - kept @ observation.T @ gain.T + gain @ measured.noise @ gain.T
+    )
+    step = np.zeros(len(covariance))
+    step[:N_OWN] = gain @ measured.innovation
+    return step, left

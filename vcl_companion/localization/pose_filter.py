@@ -28,6 +28,8 @@ from vcl_companion.localization.other_keyframes import on_own_views, on_revision
 from vcl_companion.options import require_positive
 
 _MAX_COAST_S = 60.0
+# Who brakes or turns goes on doing so for about as long.
+_LASTS_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,7 @@ def started(
         at_ns,
         0,
         ned_from_body,
+        at_ns,
     )
 
 
@@ -108,8 +111,8 @@ def predict(
 ) -> FilterState | None:
     """Carry the state to a later instant (eq. 5): constant velocity, the autopilot's attitude.
 
-    What is unknown of the motion is taken to last until the next fix: who brakes or
-    turns goes on doing so. Uncertainty therefore grows with the time, and the angle,
+    What is unknown of the motion is taken to last, a second or until the next fix: who brakes
+    or turns goes on doing so. Uncertainty therefore grows with the time, and the angle,
     since the last fix, however many predictions lie between.
 
     Args:
@@ -124,17 +127,13 @@ def predict(
     if at_ns - state.fixed_at_ns > _MAX_COAST_S * 1e9:
         return None
     dt_s = max(at_ns - state.at_ns, 0) * 1e-9
-    n = len(state.covariance)
-    transition = np.eye(n)
-    transition[POSITION, VELOCITY] = np.eye(3) * dt_s
+    until_ns = max(at_ns, state.at_ns)
+    transition = _carrying(dt_s)
     transition[SAMPLE] = 0.0
-    process = np.zeros((n, n))
-    # Unknown acceleration since the last fix: moves position by a t^2/2, speed by a t. What the
-    # state has of it already is carried over and counts once.
-    since_s = (state.at_ns - state.fixed_at_ns) * 1e-9
-    had, has = _shoved(since_s, n), _shoved(since_s + dt_s, n)
-    had = transition @ had
-    process += options.acceleration_m_s2**2 * (has @ has.T - had @ had.T)
+    process = np.zeros((N_OWN, N_OWN))
+    process += options.acceleration_m_s2**2 * _shoved(
+        state.at_ns - state.fixed_at_ns, until_ns - state.fixed_at_ns
+    )
     if ned_from_body is not None and state.ned_from_body is not None:
         offset = state.world_from_ned
         variance = np.deg2rad(options.attitude_drift_deg_s) ** 2 * dt_s
@@ -144,22 +143,29 @@ def predict(
         attitude = np.eye(3) if ned_from_body is None else ned_from_body
         offset = state.world_from_body.rotation @ attitude.T
         transition[OFFSET, SAMPLE] = state.world_from_body.rotation
+        since_s = (state.at_ns - state.turned_from_ns) * 1e-9
         variance = np.deg2rad(options.turn_rate_deg_s) ** 2 * ((since_s + dt_s) ** 2 - since_s**2)
     process[OFFSET, OFFSET] += np.eye(3) * variance
     process[SAMPLE, SAMPLE] = np.eye(3) * _sample_sigma_rad(ned_from_body, options) ** 2
+    # The keyframes stay what they are off.
+    covariance = state.covariance.copy()
+    covariance[:N_OWN] = transition @ covariance[:N_OWN]
+    covariance[:, :N_OWN] = covariance[:, :N_OWN] @ transition.T
+    covariance[:N_OWN, :N_OWN] += process
     rotation = offset @ (np.eye(3) if ned_from_body is None else ned_from_body)
     turned = np.zeros((6, 6))
     turned[:3, :3] = turned[3:, 3:] = rotation.T @ state.world_from_body.rotation
     return replace(
         state,
-        at_ns=max(at_ns, state.at_ns),
+        at_ns=until_ns,
         world_from_body=Pose(
             rotation, state.world_from_body.translation + state.velocity_world * dt_s
         ),
         world_from_ned=offset,
         ned_from_body=ned_from_body,
-        covariance=transition @ state.covariance @ transition.T + process,
+        covariance=covariance,
         own_map_covariance=turned @ state.own_map_covariance @ turned.T,
+        turned_from_ns=state.turned_from_ns if ned_from_body is None else until_ns,
     )
 
 
@@ -188,10 +194,40 @@ def update(predicted: FilterState, fix: Localized) -> FilterState | NotLocalized
     return believed.corrected(step, covariance, fix.own_map_covariance)
 
 
-def _shoved(since_s: float, n: int) -> Array:
-    """Return (n, 3) how a constant acceleration has moved the error state."""
-    out = np.zeros((n, 3))
-    out[POSITION], out[VELOCITY] = np.eye(3) * 0.5 * since_s**2, np.eye(3) * since_s
+def _carrying(dt_s: float) -> Array:
+    """Return (12, 12) how so long a time moves the error state."""
+    out = np.eye(N_OWN)
+    out[POSITION, VELOCITY] = np.eye(3) * dt_s
+    return out
+
+
+def _shoved(since_ns: int, until_ns: int) -> Array:
+    """Return (12, 12) what an unknown acceleration of 1 m/s^2 adds to the error state's covariance.
+
+    While it is the same it moves position by t^2/2 and speed by t; what the state has of it already
+    is carried over and counts once. It lasts for a while, then it is another one: were it the same
+    until the next fix, that would tell the speed of one who has stopped long ago.
+
+    Args:
+        since_ns: from when on, after the last fix.
+        until_ns: up to when.
+    """
+    out = np.zeros((N_OWN, N_OWN))
+    while since_ns < until_ns:
+        began_ns = since_ns - since_ns % _LASTS_NS
+        ends_ns = min(until_ns, began_ns + _LASTS_NS)
+        carrying = _carrying((ends_ns - since_ns) * 1e-9)
+        had = carrying @ _shove((since_ns - began_ns) * 1e-9)
+        has = _shove((ends_ns - began_ns) * 1e-9)
+        out = carrying @ out @ carrying.T + has @ has.T - had @ had.T
+        since_ns = ends_ns
+    return out
+
+
+def _shove(for_s: float) -> Array:
+    """Return (12, 3) how a constant acceleration has moved the error state."""
+    out = np.zeros((N_OWN, 3))
+    out[POSITION], out[VELOCITY] = np.eye(3) * 0.5 * for_s**2, np.eye(3) * for_s
     return out
 
 

@@ -8,8 +8,8 @@ again on top of it.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
@@ -23,12 +23,32 @@ _SAME_INSTANT_NS = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
+class _Said:
+    """A peer's proposal; see ``PoseHistory.fuse``."""
+
+    world_from_body: Pose
+    covariance: Array
+    arm_m: float
+
+    def into(self, state: FilterState) -> FilterState | NotFused:
+        return fuse(state, self.world_from_body, self.covariance, self.arm_m)
+
+
+@dataclass(frozen=True, eq=False)
 class _Step:
-    """One frame: the state after it, and what made it so."""
+    """One frame: the state after it, and what made it so.
+
+    Attributes:
+        state: with all of that in it.
+        fix: what it gave.
+        ned_from_body: (3, 3) attitude of its instant.
+        said: what peers have said of it that was taken, in that order.
+    """
 
     state: FilterState
     fix: Localized | None
     ned_from_body: Array | None
+    said: tuple[_Said, ...] = ()
 
     @property
     def fix_on_map(self) -> Localized | None:
@@ -101,9 +121,10 @@ class PoseHistory:
         """
         if self._steps and state.at_ns < self._steps[-1].state.at_ns:
             raise ValueError("states must come in the order of their time")
+        said: tuple[_Said, ...] = ()
         if self._steps and state.at_ns == self._steps[-1].state.at_ns:
-            self._steps.pop()
-        self._steps.append(_Step(state, fix, ned_from_body))
+            said = self._steps.pop().said  # the new state has it from the old one
+        self._steps.append(_Step(state, fix, ned_from_body, said))
         self._forget_before(state.at_ns)
 
     def fuse(
@@ -126,10 +147,11 @@ class PoseHistory:
         age_ns = self._steps[-1].state.at_ns - at_ns
         if k is None or age_ns > self._length_ns:
             return NotFused(f"no frame of {age_ns * 1e-9:.1f} s ago is remembered")
-        fused = fuse(self._steps[k].state, world_from_body, covariance, arm_m)
+        step, said = self._steps[k], _Said(world_from_body, covariance, arm_m)
+        fused = said.into(step.state)
         if isinstance(fused, NotFused):
             return fused
-        if not self._replay(k, _Step(fused, self._steps[k].fix, self._steps[k].ned_from_body)):
+        if not self._replay(k, replace(step, state=fused, said=(*step.said, said))):
             return NotFused("the state is too old to go on from")
         return self._steps[-1].state
 
@@ -153,12 +175,13 @@ class PoseHistory:
             # What our own frames told here went on from less than is known by now.
             before = self._steps[k - 1].state
             state = predict(before, step.state.at_ns, step.ned_from_body, self._options)
+            state = state and _with_said(state, step.said)
         if state is None:
             return None
         updated = update(state, fix)
         if isinstance(updated, NotLocalized):
             return updated
-        if not self._replay(k, _Step(updated, fix, step.ned_from_body)):
+        if not self._replay(k, replace(step, state=updated, fix=fix)):
             return None
         return updated
 
@@ -173,7 +196,9 @@ class PoseHistory:
             Whether what came since leads on from there.
         """
         k = self._nearest(state.at_ns)
-        return k is not None and self._replay(k, _Step(state, fix, self._steps[k].ned_from_body))
+        return k is not None and self._replay(
+            k, replace(self._steps[k], state=state, fix=fix, said=())
+        )
 
     def _replay(self, k: int, changed: _Step) -> bool:
         """Change a step, and apply again what came after it; False where that cannot be."""
@@ -185,7 +210,7 @@ class PoseHistory:
             if step.fix is not None:
                 updated = update(state, step.fix)
                 state = updated if isinstance(updated, FilterState) else state
-            replayed.append(_Step(state, step.fix, step.ned_from_body))
+            replayed.append(replace(step, state=_with_said(state, step.said)))
         for n, step in enumerate(replayed):
             self._steps[k + n] = step
         return True
@@ -210,3 +235,11 @@ class PoseHistory:
         if k is None or abs(self._steps[k].state.at_ns - at_ns) > _SAME_INSTANT_NS:
             return None
         return k
+
+
+def _with_said(state: FilterState, said: Sequence[_Said]) -> FilterState:
+    """Return a state with what peers have said of its instant, as far as that fits it still."""
+    for one in said:
+        fused = one.into(state)
+        state = fused if isinstance(fused, FilterState) else state
+    return state
