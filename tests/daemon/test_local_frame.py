@@ -14,6 +14,7 @@ from tests.daemon.waiting import run
 from vcl_companion.daemon.local_frame import LocalFrame
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3
+from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.links.autopilot_options import Heading
 from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.fix import Localized
@@ -56,18 +57,21 @@ def test_the_autopilots_north_is_waited_for_and_kept() -> None:
 @pytest.mark.parametrize("heading", ["map", "autopilot"])
 def test_another_world_moves_its_origin_in_the_world_and_nothing_else(heading: Heading) -> None:
     was = Pose(turned(10.0), np.array([3.0, -2.0, -1.0]))
-    other_from_world = Pose(turned(-70.0), np.array([100.0, 20.0, 5.0]))
+    other_from_world = Similarity(turned(-70.0), np.array([100.0, 20.0, 5.0]), 3.0)
     local = LocalFrame(heading)
     assert local.settles(state(was, turned(40.0) @ was.rotation))
-    before = local.from_world @ was
-    local.carry(was, other_from_world @ was)
-    after = local.from_world @ (other_from_world @ was)
-    np.testing.assert_allclose(before.local(after), 0.0, atol=1e-9)
+    # Where it is, and what a step is to its autopilot, whatever the other map takes for a metre.
+    further = Pose(was.rotation, was.translation + np.array([2.0, 0.0, 0.0]))
+    before = [local.from_world.of_pose(pose) for pose in (was, further)]
+    local.carry(other_from_world)
+    for pose, told in zip((was, further), before, strict=True):
+        after = local.from_world.of_pose(other_from_world.of_pose(pose))
+        np.testing.assert_allclose(told.local(after), 0.0, atol=1e-9)
     assert local.origin_world is not None
     np.testing.assert_allclose(local.origin_world, (100.0, 20.0, 5.0))
     local.leave()
     assert local.is_settled == (heading == "map")
-    np.testing.assert_array_equal(local.from_world.matrix(), np.eye(4))
+    np.testing.assert_array_equal(local.from_world.difference(Similarity.identity()), 0.0)
 
 
 @pytest.mark.parametrize("heading", ["map", "autopilot"])

@@ -18,6 +18,7 @@ from vcl_companion.daemon.map_building import update_map
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.localization.map_index import index_map
 from vcl_companion.mapping.keyframe_image import encode_image
 from vcl_companion.mapping.landmark_map import LandmarkMap
@@ -30,7 +31,7 @@ def believed(drone: Drone) -> Pose:
     """Where the autopilot is told that a drone is, at the instant of its clock."""
     state = drone.estimator.predicted(drone.clock.now_ns(), None)
     assert state is not None
-    return drone.estimator.local.from_world @ state.world_from_body
+    return drone.estimator.local.from_world.of_pose(state.world_from_body)
 
 
 def begins(drone: Drone) -> Array | None:
@@ -74,7 +75,7 @@ def test_a_map_of_another_world_is_merged_and_its_drone_goes_on_where_it_was(
             assert three.estimator.n_resets == 0
             # The new world is not where the old one was, or this test shows nothing.
             moved = three.estimator.local.from_world
-            assert np.abs(Pose.identity().local(moved)).max() > 1e-6
+            assert np.abs(moved.difference(Similarity.identity())).max() > 1e-6
             # Where its autopilot's frame begins in the leader's: a place in the one plus what
             # it is told there is the place in the other.
             assert three.group.leader == 1
@@ -120,7 +121,8 @@ def test_what_both_parts_of_a_swarm_have_seen_meanwhile_is_kept(tmp_path: Path) 
             seen = {(k.drone_id, k.captured_at_ns) for k in merged.index.landmark_map.keyframes}
             assert {(3, demo.shot(3, k).at_ns) for k in (6, 12)} <= seen
             assert not three.events("world")  # it is the same
-            assert np.abs(Pose.identity().local(three.estimator.local.from_world)).max() == 0.0
+            stays = three.estimator.local.from_world.difference(Similarity.identity())
+            np.testing.assert_array_equal(stays, 0.0)
 
     run(scenario())
 

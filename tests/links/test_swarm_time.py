@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.links.signed import NOON, NOON_S, Clocks
-from vcl_companion.links.swarm_time import EARLIEST, LATEST, SwarmTime, TimeOptions
+from vcl_companion.links.swarm_time import EARLIEST, END, LATEST, SwarmTime
 
 S = 100_000  # ticks
 DAY = 86400 * S
@@ -44,7 +44,7 @@ def test_a_wall_clock_that_is_set_back_changes_nothing() -> None:
 def test_a_clock_of_an_absurd_year_is_not_believed() -> None:
     clocks = Clocks(wall_s=5e9)
     assert SwarmTime(NOON, clocks.now()).at(clocks.now()) == NOON
-    assert SwarmTime(2**48 - 1, clocks.now()).at(clocks.now()) == LATEST
+    assert SwarmTime(2**48 - 1, clocks.now()).at(clocks.now()) == END
 
 
 def test_who_is_behind_is_told_by_an_answer_to_its_own_question() -> None:
@@ -73,24 +73,33 @@ def test_a_late_answer_is_no_answer() -> None:
 
 def test_nobody_is_followed_into_the_far_future() -> None:
     clocks = Clocks()
-    time = SwarmTime(0, clocks.now(), TimeOptions(followed_s=10 * 365.25 * 86400.0))
+    time = SwarmTime(0, clocks.now())
     assert time.asks(7, clocks.now())
-    for timestamp in (2**48 - 1, LATEST + 1, NOON + 10 * YEAR + S):
+    for timestamp in (2**48 - 1, LATEST + 1):
         assert time.told(7, timestamp, clocks.now()) is None
     assert time.at(clocks.now()) == NOON
-    assert time.told(7, NOON + 10 * YEAR, clocks.now()) is not None
+    assert time.told(7, LATEST, clocks.now()) is not None
 
 
-def test_nor_in_several_steps_but_as_far_ahead_of_a_clock_that_is_set() -> None:
+def test_what_one_is_told_the_others_can_be_told_whatever_their_clocks_say() -> None:
+    """Or a wrong clock would part those who follow it from those who do not."""
+    clocks = [Clocks(), Clocks(wall_s=NOON_S - 30.0), Clocks(wall_s=0.0)]
+    times = [SwarmTime(0, c.now()) for c in clocks]
+    for said in (NOON + 10 * YEAR - S, NOON + 30 * YEAR, LATEST):
+        for c, time in zip(clocks, times, strict=True):
+            assert time.asks(said, c.pass_s(10.0))
+            assert time.told(said, said, c.now()) is not None
+            assert time.at(c.now()) == said
+
+
+def test_who_was_told_the_latest_time_goes_on_from_there_after_a_restart() -> None:
     clocks = Clocks()
-    time = SwarmTime(0, clocks.now(), TimeOptions(followed_s=10 * 365.25 * 86400.0))
-    for number, years in ((7, 6), (8, 12)):
-        assert time.asks(number, clocks.pass_s(10.0))
-        said = time.told(number, NOON + years * YEAR, clocks.now())
-        assert (said is None) == (years > 10)
-    clocks.wall_s += 5 * 31_557_600.0  # a time server is found
-    assert time.told(8, NOON + 12 * YEAR, clocks.now()) is not None
-    assert time.at(clocks.now()) == NOON + 12 * YEAR
+    time = SwarmTime(0, clocks.now())
+    assert time.asks(7, clocks.now())
+    assert time.told(7, LATEST, clocks.now()) is not None
+    mark = time.next(clocks.pass_s(3600.0))
+    assert mark > LATEST
+    assert SwarmTime(mark, clocks.now()).at(clocks.now()) == mark
 
 
 def test_a_member_is_not_answered_more_often_than_it_needs() -> None:
@@ -117,7 +126,7 @@ def test_it_rises_whatever_happens(
     clocks = Clocks(wall_s=wall_s)
     time = SwarmTime(reserved, clocks.now())
     before, signed = time.at(clocks.now()), time.next(clocks.now())
-    assert before >= min(reserved, LATEST)
+    assert before >= min(reserved, END)
     for k, (set_s, pass_s, said, asked) in enumerate(steps):
         clocks.wall_s += set_s
         now = clocks.pass_s(pass_s)

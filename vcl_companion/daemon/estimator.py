@@ -11,7 +11,13 @@ from vcl_companion.daemon.last_own_fix import FRESH_NS, LastOwnFix
 from vcl_companion.daemon.local_frame import LocalFrame
 from vcl_companion.daemon.map_in_sight import MapInSight
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, exp_so3, log_so3, quaternion_from_matrix
+from vcl_companion.geometry.rotation import (
+    Array,
+    exp_so3,
+    heading_of,
+    log_so3,
+    quaternion_from_matrix,
+)
 from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.geometry.worst_sigma import worst_sigma
 from vcl_companion.links.autopilot_options import Heading
@@ -33,6 +39,8 @@ _SETTLE_S = 0.5
 # How we turn is told by so long; it does not go on for ever.
 _TURNED_NS, _FURTHEST_RAD = 330_000_000, np.deg2rad(60.0)
 _LEAST_ARM_M = 1.0
+# Of what a heading may be off, this share is left to each of the two that are compared.
+_DRAWN_ASIDE = 0.5
 
 
 class Estimator:
@@ -69,6 +77,8 @@ class Estimator:
         self._has_begun = False
         self.n_resets = 0
         """How often the pose has jumped."""
+        self.n_forgotten = 0
+        """How often all was forgotten: what was looked at before is led by what counts no more."""
         self.n_displaced = 0
         """How often it has to where our own frames had not led: these are no help there."""
         self.local = LocalFrame(heading)
@@ -80,7 +90,16 @@ class Estimator:
 
     @property
     def has_heading(self) -> bool:
-        """Whether the autopilot's heading is by the map's north but for a few degrees."""
+        """Whether the autopilot's heading is by the map's north but for a few degrees.
+
+        One that our fixes have shown to be off by more, as a compass beside steel is, says no more
+        than how it changes: it would refuse every fix that is right.
+        """
+        state = self._history.newest
+        if state is not None and state.ned_from_body is not None:
+            off_deg = abs(math.degrees(heading_of(state.world_from_ned)))
+            if off_deg > _DRAWN_ASIDE * self._localization.max_heading_deg:
+                return False
         return self._has_heading()
 
     def for_peers(self, at_ns: int, ned_from_body: Array | None) -> tuple[Array | None, bool]:
@@ -151,6 +170,7 @@ class Estimator:
 
     def forget(self) -> None:
         """Know nothing of where we are any more: the next frame is looked for everywhere."""
+        self.n_forgotten += 1
         self._history.clear()
         self._n_contradicted = 0
         self.last_own_fix.forget()
@@ -355,12 +375,8 @@ class Estimator:
         if newest is not None:
             there = carried(newest, other_from_world)
             self._history.append(there, None, newest.ned_from_body)
-            was, now = newest.world_from_body, there.world_from_body
-        else:
-            was = Pose.identity()
-            now = other_from_world.of_pose(was)
         if self._keeps_local:
-            self.local.carry(was, now)
+            self.local.carry(other_from_world)
         else:
             self.local.leave()
             self._jump("joined another world")

@@ -14,8 +14,8 @@ import math
 import numpy as np
 
 from vcl_companion.daemon.map_store import StoredMap
-from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, about_down, heading_of
+from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.links.autopilot_options import Heading
 from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.swarm.group import Group
@@ -33,7 +33,7 @@ class LocalFrame:
 
     def __init__(self, heading: Heading) -> None:
         self._heading = heading
-        self.from_world = Pose.identity()
+        self.from_world = Similarity.identity()
         """local_from_world, once it is settled."""
         self.is_settled = heading == "map"
 
@@ -46,21 +46,26 @@ class LocalFrame:
         """Whether poses can be told: with the autopilot's own north not before it has told it."""
         if not self.is_settled and state.ned_from_body is not None:
             north_rad = heading_of(state.world_from_ned.T)
-            self.from_world = Pose(about_down(north_rad), np.zeros(3))
+            self.from_world = Similarity(about_down(north_rad), np.zeros(3))
             self.is_settled = True
             _log.info(
                 "the map's north is at %.1f degrees by the autopilot", math.degrees(north_rad)
             )
         return self.is_settled
 
-    def carry(self, was: Pose, now: Pose) -> None:
-        """Stay where it is while the world becomes another, in which ``was`` is ``now``."""
+    def carry(self, other_from_world: Similarity) -> None:
+        """Stay where it is while the world becomes another.
+
+        Its metres stay what they were, too: an autopilot that is told others on its way takes that
+        for motion, and a map of another scale, wrong or sent by one that lies, would have it fly
+        as many times as far.
+        """
         if self.is_settled:
-            self.from_world = self.from_world @ was @ now.inverse()
+            self.from_world = self.from_world @ other_from_world.inverse()
 
     def leave(self) -> None:
         """Begin anew in another world, at its origin."""
-        self.from_world = Pose.identity()
+        self.from_world = Similarity.identity()
         self.is_settled = self._heading == "map"
 
 

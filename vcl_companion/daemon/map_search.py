@@ -122,7 +122,7 @@ class MapSearch:
             has_heading=self._estimator.has_heading,
         )
         while True:
-            began_s = asyncio.get_running_loop().time()
+            began_s, n_forgotten = asyncio.get_running_loop().time(), self._estimator.n_forgotten
             predicted = self._estimator.predicted(frame.captured_at_ns, sought.ned_from_body)
             prior = predicted.prior() if predicted else None
             fix = await fix_or_none(
@@ -130,6 +130,9 @@ class MapSearch:
                     np.asarray(frame.image), stored, prior, sought.ned_from_body, effort
                 )
             )
+            if self._estimator.n_forgotten != n_forgotten:
+                stored = self._maps.current or stored
+                continue  # it may have been led there
             if not self._maps.has_left_world(stored.world):
                 if isinstance(fix, Localized):
                     self._pause_s = 0.0

@@ -102,23 +102,30 @@ class OwnFixes:
     async def look(self, frame: Frame, stored: StoredMap) -> Look:
         """Look at a frame on a map: by its patches, or all over it where it has none.
 
-        Where the world of that map is left meanwhile, on the one that is in use then. Where it
-        hardly shows the frame, by our own last frames.
+        Where the world of that map is left meanwhile, on the one that is in use then; where all is
+        forgotten that it was led by, once more. Where it hardly shows the frame, by our own last
+        frames.
         """
         while True:
+            n_forgotten = self._estimator.n_forgotten
             ned_from_body = await self._attitude_of(frame)
             now_s = asyncio.get_running_loop().time()
             may_doubt = now_s >= self._doubted_at_s + _DOUBT_EVERY_S
             effort = Effort(may_search=stored.templates is None, may_doubt=may_doubt)
             fix = await self._localized(frame, stored, ned_from_body, effort)
             look = Look(stored, ned_from_body, fix, now_s)
-            if not self._maps.has_left_world(stored.world):
+            if self._still_counts(stored, n_forgotten):
                 if isinstance(fix, Localized) and is_doubtful(fix):
                     self._doubted_at_s = now_s
                 look = await self._by_odometry(frame, look) or look
-            if not self._maps.has_left_world(stored.world):  # nor while that was looked at
+            if self._still_counts(stored, n_forgotten):  # after that was looked at, too
                 return look
             stored = self._maps.current or stored
+
+    def _still_counts(self, stored: StoredMap, n_forgotten: int) -> bool:
+        """Whether what a frame has given counts still: its world, and what it was led by, do."""
+        is_in_world = not self._maps.has_left_world(stored.world)
+        return is_in_world and self._estimator.n_forgotten == n_forgotten
 
     async def _by_odometry(self, frame: Frame, on_map: Look) -> Look | None:
         """Look at a frame by our own last frames, if these may tell more; None if they do not."""
@@ -155,15 +162,16 @@ class OwnFixes:
         """Look at a frame by patches alone, once.
 
         Returns:
-            What that gave; None without a map that has some, or where its world was left meanwhile.
+            What that gave; None without a map that has some, or where its world was left meanwhile,
+            or what led it forgotten.
         """
         stored = self._maps.current
         if stored is None or stored.templates is None:
             return None
         ned_from_body = await self._attitude_of(frame)
-        now_s = asyncio.get_running_loop().time()
+        now_s, n_forgotten = asyncio.get_running_loop().time(), self._estimator.n_forgotten
         fix = await self._localized(frame, stored, ned_from_body, _PATCHES_ALONE)
-        if self._maps.has_left_world(stored.world):
+        if not self._still_counts(stored, n_forgotten):
             return None
         return Look(stored, ned_from_body, fix, now_s)
 

@@ -22,6 +22,7 @@ from vcl_companion.daemon.pacer import Pacer
 from vcl_companion.daemon.resets import Resets
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions
 from vcl_companion.links.texts import Severity
@@ -59,7 +60,7 @@ class _Told:
     """A pose that was told: the state, the frame of then, and by how much it slid in that."""
 
     state: FilterState
-    local_from_world: Pose
+    local_from_world: Similarity
     shift: Pose
 
 
@@ -180,8 +181,11 @@ class Teller:
         if not local.settles(state):
             return "the autopilot has not said its heading"
         local_from_world = local.from_world
-        pose = local_from_world @ state.world_from_body
-        covariance, velocity = state.pose_covariance(), state.velocity_covariance()
+        pose = local_from_world.of_pose(state.world_from_body)
+        metres = local_from_world.scale
+        stretching = np.diag([metres] * 3 + [1.0] * 3)
+        covariance = stretching @ state.pose_covariance() @ stretching
+        velocity = metres**2 * state.velocity_covariance()
         if share is None:
             waits = self._placed(pose, covariance, state, at_ns)
             if waits:
@@ -196,7 +200,7 @@ class Teller:
             PoseEstimate(
                 told,
                 covariance,
-                turn @ state.velocity_world + slides_m_s,
+                metres * turn @ state.velocity_world + slides_m_s,
                 turn @ velocity @ turn.T,
                 at_ns,
                 self._resets.n_resets,
@@ -215,7 +219,7 @@ class Teller:
         if last is not None and not was_silent:
             there = self._estimator.carried_on(last.state, at_ns, state.ned_from_body)
             if there is not None:
-                expected = last.shift @ last.local_from_world @ there.world_from_body
+                expected = last.shift @ last.local_from_world.of_pose(there.world_from_body)
         else:
             position = self._autopilot.expected_at(at_ns)
             expected = None if position is None else Pose(pose.rotation, position)

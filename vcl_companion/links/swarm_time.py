@@ -17,10 +17,10 @@ So the swarm's time is its own. It is the **latest** that any member knows, and 
 * One who is far behind must be able to ask, so a question is answered whatever its own
   timestamp. That gives nothing away: an answer to an old question is nobody's any more.
 
-Members are followed to ten years ahead of what this drone knows itself at most, in one run: a
-clock that is further ahead is broken, and does not take the swarm with it. One that has
-followed a wrong clock stays ahead; that does no harm, since its peers are there as well, and
-who joins is told.
+Whatever is later, up to the end of 2075, wins for everybody: were it followed by so many years
+of each drone's own only, one would follow a wrong clock that another refuses, and none of the two
+would take anything of the other any more. A swarm that has followed a wrong clock stays ahead;
+that does no harm, since all are there, and who joins is told.
 """
 
 from __future__ import annotations
@@ -31,10 +31,12 @@ from vcl_companion.clock import Moment
 
 TICK_NS = 10_000
 TICKS_PER_S = 100_000
-# 1 January of 2015, the start of MAVLink's timestamps, 2026 and 2076, in s since 1970.
-_ZERO_S, _FIRST_S, _LAST_S = 1_420_070_400, 1_767_225_600, 3_345_062_400
+# 1 January of 2015, the start of MAVLink's timestamps, 2026, 2076 and 2100, in s since 1970.
+_ZERO_S, _FIRST_S, _LAST_S, _END_S = 1_420_070_400, 1_767_225_600, 3_345_062_400, 4_102_444_800
 EARLIEST = (_FIRST_S - _ZERO_S) * TICKS_PER_S
 LATEST = (_LAST_S - _ZERO_S) * TICKS_PER_S
+# A swarm that was told the latest time runs on from there in all its flights. MAVLink ends in 2104.
+END = (_END_S - _ZERO_S) * TICKS_PER_S
 
 
 @dataclass(frozen=True)
@@ -42,14 +44,11 @@ class TimeOptions:
     """How the swarm's time is learned.
 
     Attributes:
-        followed_s: a member that is further ahead of our own clock, or of the mark that we began
-            at, is not followed: not in several steps either.
         asked_s: how long an answer is waited for before the next question; it is how far
             behind a delayed answer can leave us.
         answered_s: a member is answered no more often than this.
     """
 
-    followed_s: float = 10 * 365.25 * 86400.0
     asked_s: float = 3.0
     answered_s: float = 0.2
 
@@ -57,11 +56,6 @@ class TimeOptions:
 def wall_ticks(wall_ns: int) -> int:
     """Return a wall clock's instant in MAVLink's timestamps; below 0 before 2015."""
     return wall_ns // TICK_NS - _ZERO_S * TICKS_PER_S
-
-
-def _since(base: int, at_ns: int, now: Moment) -> int:
-    """Return what time it is now that it was ``base`` at an instant of the monotonic clock."""
-    return base + max(0, now.monotonic_ns - at_ns) // TICK_NS
 
 
 class SwarmTime:
@@ -75,19 +69,16 @@ class SwarmTime:
 
     def __init__(self, earliest: int, now: Moment, options: TimeOptions | None = None) -> None:
         self._options = options or TimeOptions()
-        self._base = min(max(earliest, EARLIEST), LATEST)
+        self._base = min(max(earliest, EARLIEST), END)
         self._base_at_ns = now.monotonic_ns
-        self._own, self._own_at_ns = self._base, now.monotonic_ns  # whatever others have said
         self._last = self._base
         self._asked: tuple[int, int] | None = None
         self._answered_at_ns: dict[int, int] = {}
 
     def at(self, now: Moment) -> int:
         """Return the time; it never falls."""
-        running = _since(self._base, self._base_at_ns, now)
+        running = self._base + max(0, now.monotonic_ns - self._base_at_ns) // TICK_NS
         wall = wall_ticks(now.wall_ns)
-        if _since(self._own, self._own_at_ns, now) < wall <= LATEST:
-            self._own, self._own_at_ns = wall, now.monotonic_ns
         if running < wall <= LATEST:
             self._base, self._base_at_ns = wall, now.monotonic_ns
             return wall
@@ -133,9 +124,7 @@ class SwarmTime:
         if self._since_s(self._asked[1], now) >= self._options.asked_s:
             return None
         ahead_s = (timestamp - self.at(now)) / TICKS_PER_S
-        own = _since(self._own, self._own_at_ns, now)
-        is_followed = timestamp - own <= self._options.followed_s * TICKS_PER_S
-        if not (ahead_s > 0.0 and is_followed) or timestamp > LATEST:
+        if not ahead_s > 0.0 or timestamp > LATEST:
             return None
         self._base, self._base_at_ns = timestamp, now.monotonic_ns
         return ahead_s
