@@ -97,10 +97,11 @@ def test_attitudes_become_rotations() -> None:
     np.testing.assert_allclose(sample.ned_from_body, matrix_from_euler(0.25, -0.5, 1.5), atol=1e-12)
 
 
-def test_body_rates_become_the_rate_of_the_heading() -> None:
+def test_body_rates_are_taken_and_become_the_rate_of_the_heading() -> None:
     on_its_side = decoded(wire.packed(wire.ATTITUDE, 7, math.pi / 2, 0, 0.3, 0, 2.0, 0.5))
     assert isinstance(on_its_side, AttitudeSample)
     assert on_its_side.heading_rate_rad_s == pytest.approx(2.0)  # its right wing points down
+    assert on_its_side.body_rates_rad_s == pytest.approx(np.array([0.0, 2.0, 0.5]))
     upright = decoded(
         wire.packed(wire.ATTITUDE_QUATERNION, 7, 1, 0, 0, 0, 3.0, 2.0, -0.5, 0, 0, 0, 0)
     )
@@ -111,6 +112,7 @@ def test_body_rates_become_the_rate_of_the_heading() -> None:
         unknown = decoded(wire.packed(wire.ATTITUDE, 7, 0.25, -0.5, 1.5, rate, 0, 0))
         assert isinstance(unknown, AttitudeSample)
         assert unknown.heading_rate_rad_s is None
+        assert unknown.body_rates_rad_s is None
 
 
 @pytest.mark.parametrize(

@@ -133,8 +133,7 @@ async def _listen(motion: Motion, link: AutopilotLink, clock: Clock) -> None:
     while True:
         while next_ns < clock.now_ns() - _SETTLED_NS:
             attitude = await link.attitudes.at(next_ns, 0.0)
-            # Only what was said of that instant, not of the nearest that there is.
-            if attitude is not None and attitude.at_ns == next_ns:
+            if attitude is not None:
                 motion.said_ns.append(next_ns)
                 motion.said.append(attitude.ned_from_body)
             next_ns += _ATTITUDE_STEP_NS

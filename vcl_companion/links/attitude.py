@@ -4,16 +4,18 @@ An attitude carries the autopilot's milliseconds since its start. They are
 turned into our time only when an attitude is asked for, by the best offset
 known then.
 
-An autopilot that begins to take its heading from our poses turns its north at once, by what it
-was wrong. Nobody turns so fast, and its gyros do not feel it: its attitudes are told on as if it
-had not. One that was told no pose yet has found its north by itself, as a PX4 does by its compass
-soon after its start.
+The attitude at an instant is made of what was said around it, or shortly before: who turns by 60
+degrees in a second is 6 degrees further after 0.1 s, and to those who ask it is the frame's own,
+known to a fraction of a degree. Where nothing says how the drone turned, there is none.
+
+An autopilot that turns its north (``north_turns``) is told on as if it had not, when that is to
+ours. One that was told no pose yet has found its north by itself, as a PX4 does by its compass soon
+after its start.
 """
 
 from __future__ import annotations
 
 import bisect
-import math
 from collections import deque
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -22,6 +24,7 @@ import numpy as np
 
 from vcl_companion.geometry.rotation import Array, about_down, exp_so3, log_so3
 from vcl_companion.links.messages import AttitudeSample
+from vcl_companion.links.north_turns import LEAST_SHARE, north_turned_rad, rate_before
 
 _NS_PER_MS = 1_000_000
 # The stamp is cut off to whole milliseconds: on average the truth is half of one later.
@@ -34,30 +37,24 @@ _ARRIVALS = 128
 # frame need not wait for the sample after it. At 2 rad/s^2 that is wrong by 0.04 degrees.
 _CARRIED_NS = 25_000_000
 _CARRIED_STEPS = 1.25
-
-# What a heading changes by beyond its last rate is the autopilot's doing when it is more than
-# the noise of two samples, more than a drone can accelerate its turn, and not between what the
-# gyros say at both samples.
-_HEADING_NOISE_RAD = math.radians(1.5)
-_HEADING_ACCELERATION_RAD_S2 = 20.0
-# A rate is by samples at least so far from each other, as a share of how long it is carried on.
-_LEAST_SHARE, _MOST_STEPS_BACK = 0.7, 16
+# What comes no more turns on so long as at the nearest sample: at 2 rad/s^2 that is wrong by half a
+# degree.
+_MOST_CARRIED_NS = 100_000_000
+# So long it may turn as nobody has said, by 0.3 degrees at 60 degrees in a second.
+_HELD_NS = 5_000_000
 
 Taken = Literal["taken", "overtaken", "rebooted", "turned"]
 
 
 @dataclass(frozen=True, eq=False)
 class Attitude:
-    """Where the body's axes point.
+    """Where the body's axes point at the instant that was asked for.
 
     Attributes:
         ned_from_body: (3, 3) rotation.
-        at_ns: our clock. It is the instant asked for when samples lie on both
-            sides of it or shortly before it, else the instant of the nearest sample.
     """
 
     ned_from_body: Array
-    at_ns: int
 
     def __post_init__(self) -> None:
         if self.ned_from_body.shape != (3, 3):
@@ -110,7 +107,7 @@ class AttitudeHistory:
             elif later_ms == 0:
                 self._samples.pop()
         sample = self._in_first_north(sample)
-        step_rad = self._turned_by(sample)
+        step_rad = north_turned_rad(self._samples, sample)
         if step_rad:
             taken = "turned"
             self._north_rad += step_rad
@@ -168,9 +165,10 @@ class AttitudeHistory:
             offset_ns: our clock minus the autopilot's.
 
         Returns:
-            interpolated on the arc between the samples around it, or carried on from
-            two shortly before it, or the nearest sample when all are on one side;
-            None when the nearest is further away than the allowed age.
+            interpolated on the arc between the samples around it; or, where these are further
+            apart than twice the allowed age or all are on one side, turned on from the nearest;
+            None when the nearest is further away than the allowed age or 0.1 s, or nothing
+            says how it turned there.
         """
         index = bisect.bisect_left(
             self._samples, at_ns, key=lambda sample: self._measured_ns(sample) + offset_ns
@@ -179,13 +177,38 @@ class AttitudeHistory:
         times = [self._measured_ns(sample) + offset_ns for sample in around]
         if not around or min(abs(at_ns - time) for time in times) > self._max_age_ns:
             return None
-        if len(around) == 1:
-            steps = self._steps_ahead(at_ns, offset_ns)
-            if steps is None:
-                return Attitude(around[0].ned_from_body, times[0])
-            return Attitude(_on_arc(self._samples[-2], self._samples[-1], 1.0 + steps), at_ns)
-        fraction = (at_ns - times[0]) / (times[1] - times[0])
-        return Attitude(_on_arc(around[0], around[1], fraction), at_ns)
+        if len(around) == 2 and times[1] - times[0] <= 2 * self._max_age_ns:
+            fraction = (at_ns - times[0]) / (times[1] - times[0])
+            return Attitude(_on_arc(around[0], around[1], fraction))
+        steps = self._steps_ahead(at_ns, offset_ns)
+        if steps is not None:
+            return Attitude(_on_arc(self._samples[-2], self._samples[-1], 1.0 + steps))
+        nearest, time_ns = min(zip(around, times, strict=True), key=lambda one: abs(at_ns - one[1]))
+        return self._turned_on(nearest, at_ns - time_ns)
+
+    def _turned_on(self, sample: AttitudeSample, ahead_ns: int) -> Attitude | None:
+        """Return the attitude so long after a sample, or before it; None if nothing tells of it."""
+        ahead_s = ahead_ns * 1e-9
+        rate = self._rate_at(sample, ahead_s)
+        if rate is None:
+            return Attitude(sample.ned_from_body) if abs(ahead_ns) <= _HELD_NS else None
+        if abs(ahead_ns) > _MOST_CARRIED_NS:
+            return None
+        return Attitude(exp_so3(rate * ahead_s) @ sample.ned_from_body)
+
+    def _rate_at(self, sample: AttitudeSample, ahead_s: float) -> Array | None:
+        """Return the (3,) rate about north, east, down to turn on by, rad/s; None: not known.
+
+        By the gyros; of who tells nothing of these by how it turned until the newest sample.
+        """
+        if sample.body_rates_rad_s is not None:
+            return np.asarray(sample.ned_from_body @ sample.body_rates_rad_s)
+        by_samples = rate_before(self._samples, ahead_s)
+        if sample is not self._samples[-1] or by_samples is None:
+            return None
+        rate, step_s = by_samples
+        is_long_enough = LEAST_SHARE * ahead_s <= step_s <= 2e-9 * self._max_age_ns
+        return rate if is_long_enough else None
 
     def _steps_ahead(self, at_ns: int, offset_ns: int) -> float | None:
         """Return how far an instant lies behind the newest sample, in steps to the one before.
@@ -197,7 +220,8 @@ class AttitudeHistory:
         before, last = self._samples[-2], self._samples[-1]
         step_ns = self._measured_ns(last) - self._measured_ns(before)
         ahead_ns = at_ns - self._newest_ns(offset_ns)
-        if not 0 <= ahead_ns <= min(_CARRIED_NS, _CARRIED_STEPS * step_ns):
+        most_ns = min(_CARRIED_NS, _CARRIED_STEPS * step_ns)
+        if step_ns > 2 * self._max_age_ns or not 0 <= ahead_ns <= most_ns:
             return None
         return ahead_ns / step_ns
 
@@ -206,47 +230,6 @@ class AttitudeHistory:
             return sample
         return replace(sample, ned_from_body=about_down(-self._north_rad) @ sample.ned_from_body)
 
-    def _turned_by(self, sample: AttitudeSample) -> float:
-        """Return by how much the autopilot turned its north before a sample, rad; 0 if not."""
-        if not self._samples:
-            return 0.0
-        last = self._samples[-1]
-        since_s = self._s_between(last, sample)
-        expected = self._rate_before(since_s) or _rate_felt(since_s, last, sample)
-        if expected is None:
-            return 0.0
-        rate_rad_s, step_s = expected
-        change_rad = _heading_change(last, sample)
-        beyond_rad = change_rad - rate_rad_s * since_s
-        possible_rad = _HEADING_NOISE_RAD * max(1.0, since_s / step_s)
-        possible_rad += _HEADING_ACCELERATION_RAD_S2 * since_s * max(step_s, since_s)
-        is_own = abs(beyond_rad) <= possible_rad or _is_felt(change_rad, since_s, last, sample)
-        return 0.0 if is_own else beyond_rad
-
-    def _rate_before(self, since_s: float) -> tuple[float, float] | None:
-        """Return the rate to carry on for so long, rad/s, and the time that it is by; None: none.
-
-        Both by the samples before, of which one is too few.
-        """
-        if len(self._samples) < 2:
-            return None
-        before, last = self._far_enough_back(since_s), self._samples[-1]
-        step_s = self._s_between(before, last)
-        return (_heading_change(before, last) / step_s, step_s) if step_s > 0.0 else None
-
-    def _far_enough_back(self, since_s: float) -> AttitudeSample:
-        """Return the sample to take the rate by that is carried on for so long; of two or more.
-
-        By one close to the newest it would be mostly noise, and they do come at odd times.
-        """
-        back = range(2, min(len(self._samples), _MOST_STEPS_BACK) + 1)
-        last, earlier = self._samples[-1], [self._samples[-i] for i in back]
-        far = (s for s in earlier if self._s_between(s, last) >= _LEAST_SHARE * since_s)
-        return next(far, earlier[-1])
-
-    def _s_between(self, before: AttitudeSample, after: AttitudeSample) -> float:
-        return (self._measured_ns(after) - self._measured_ns(before)) * 1e-9
-
     def _newest_ns(self, offset_ns: int) -> int:
         return self._measured_ns(self._samples[-1]) + offset_ns
 
@@ -254,34 +237,6 @@ class AttitudeHistory:
     def _measured_ns(sample: AttitudeSample) -> int:
         """Return the likeliest instant of a sample by the autopilot's clock, ns."""
         return sample.time_boot_ms * _NS_PER_MS + _CUT_OFF_NS
-
-
-def _heading_change(before: AttitudeSample, after: AttitudeSample) -> float:
-    """Return by how much a body turned about the vertical from one sample to another, rad."""
-    return float(log_so3(after.ned_from_body @ before.ned_from_body.T)[2])
-
-
-def _felt(*samples: AttitudeSample) -> list[float]:
-    """Return what the gyros say of the heading at those of some samples that tell, rad/s."""
-    return [s.heading_rate_rad_s for s in samples if s.heading_rate_rad_s is not None]
-
-
-def _rate_felt(since_s: float, *samples: AttitudeSample) -> tuple[float, float] | None:
-    """Return the mean of what the gyros say at samples so far apart, and that time.
-
-    None where one does not say.
-    """
-    rates = _felt(*samples)
-    return (sum(rates) / len(rates), since_s) if len(rates) == len(samples) else None
-
-
-def _is_felt(change_rad: float, since_s: float, *samples: AttitudeSample) -> bool:
-    """Whether a change of heading lies between what the gyros say at these samples."""
-    known = _felt(*samples)
-    if not known:
-        return False
-    least, most = min(known) * since_s, max(known) * since_s
-    return least - _HEADING_NOISE_RAD <= change_rad <= most + _HEADING_NOISE_RAD
 
 
 def _on_arc(before: AttitudeSample, after: AttitudeSample, fraction: float) -> Array:

@@ -31,7 +31,8 @@ class AutopilotOptions:
         allowed_senders: for udpin, addresses or networks that may be the autopilot; empty: any.
         attitude_rate_hz: rate of ATTITUDE_QUATERNION that we ask for.
         attitude_latency_s: from measuring to arriving, for an autopilot without TIMESYNC.
-        max_attitude_age_s: how far from a frame's instant an attitude may be.
+        max_attitude_age_s: how far from a frame's instant an attitude may be that it is told by:
+            from both between which it lies, or from the one that is turned on, 0.1 s at most.
         profile: whose reading of a pose's covariance it is made for: ``ardupilot`` or ``px4``;
             ``auto``: whose the autopilot's HEARTBEAT says it is; ``plain``: as it is.
         message: in which poses are sent: ``vision_position_estimate``, or ``odometry``, which

@@ -59,18 +59,27 @@ class AttitudeSample(Message):
         time_boot_ms: milliseconds since the autopilot's start, cut off, not rounded.
         ned_from_body: (3, 3) rotation.
         source: the message that it came in.
-        heading_rate_rad_s: how fast its gyros say that it turns about down; None for unknown.
+        body_rates_rad_s: (3,) how fast its gyros say that it turns about the body's axes;
+            None for unknown.
     """
 
     time_boot_ms: int
     ned_from_body: Array
     source: Literal["quaternion", "euler"]
-    heading_rate_rad_s: float | None = None
+    body_rates_rad_s: Array | None = None
 
     def __post_init__(self) -> None:
         if self.ned_from_body.shape != (3, 3):
             raise ValueError(f"an attitude is (3, 3), got {self.ned_from_body.shape}")
         self.ned_from_body.flags.writeable = False
+        if self.body_rates_rad_s is not None:
+            self.body_rates_rad_s.flags.writeable = False
+
+    @property
+    def heading_rate_rad_s(self) -> float | None:
+        """How fast its gyros say that it turns about down, rad/s; None for unknown."""
+        rates = self.body_rates_rad_s
+        return None if rates is None else float(self.ned_from_body[2] @ rates)
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ def _attitude(m: Any, sender: _Sender) -> Message | str:
     if not all(map(math.isfinite, angles)):
         return "attitude is no rotation"
     rotation = matrix_from_euler(*angles)
-    return AttitudeSample(*sender, m.time_boot_ms, rotation, "euler", _heading_rate(m, rotation))
+    return AttitudeSample(*sender, m.time_boot_ms, rotation, "euler", _body_rates(m))
 
 
 def _attitude_quaternion(m: Any, sender: _Sender) -> Message | str:
@@ -70,18 +70,16 @@ def _attitude_quaternion(m: Any, sender: _Sender) -> Message | str:
     if not abs(float(np.linalg.norm(quaternion)) - 1.0) < _QUATERNION_NORM_TOLERANCE:
         return "attitude is no rotation"
     rotation = matrix_from_quaternion(quaternion)
-    rate = _heading_rate(m, rotation)
-    return AttitudeSample(*sender, m.time_boot_ms, rotation, "quaternion", rate)
+    return AttitudeSample(*sender, m.time_boot_ms, rotation, "quaternion", _body_rates(m))
 
 
-def _heading_rate(m: Any, ned_from_body: Array) -> float | None:
-    """Return the rate about down of the body rates of either message; None where they are none.
+def _body_rates(m: Any) -> Array | None:
+    """Return the (3,) body rates of either message, rad/s; None where they are none.
 
     All zero is what a simulator says that has no gyros: real ones are never that still.
     """
     rates = np.array([m.rollspeed, m.pitchspeed, m.yawspeed])
-    rate = float(ned_from_body[2] @ rates)
-    return rate if math.isfinite(rate) and rates.any() else None
+    return rates if np.all(np.isfinite(rates)) and rates.any() else None
 
 
 def _ekf_status_report(m: Any, sender: _Sender) -> Message | str:
