@@ -1,4 +1,4 @@
-"""Whose north attitudes are told in when the autopilot restarts in the middle of it."""
+"""Attitudes by our clock: whose north after a restart, and how long one is waited for."""
 
 from __future__ import annotations
 
@@ -74,3 +74,74 @@ def test_a_north_that_is_turned_long_after_a_restart_turns_nobody() -> None:
 def test_before_the_first_pose_any_north_is_its_own() -> None:
     told = heading_deg(restarts_ms=None, turns_ms=5000, is_told=False, has_own_north=False)
     assert told == pytest.approx(150.0, abs=0.1)
+
+
+def timed_by_arrival(clock: ManualClock) -> TimedAttitude:
+    """One whose autopilot does not answer questions about time."""
+    options = AutopilotOptions(link="udp:127.0.0.1:1", attitude_latency_s=0.0)
+    timed = TimedAttitude(options, clock, lambda _: None, lambda: True)
+    for _ in range(10):
+        timed._sync.ask(clock.now_ns())
+    return timed
+
+
+async def waits_s(timed: TimedAttitude, at_ns: int, n: int) -> list[float]:
+    """Return how long so many frames of an instant wait for their attitude, s."""
+    loop, waited = asyncio.get_running_loop(), []
+    for _ in range(n):
+        began_s = loop.time()
+        await timed.at(at_ns, 0.1)
+        waited.append(loop.time() - began_s)
+    return waited
+
+
+@pytest.mark.parametrize("has_spoken", [False, True])
+def test_who_says_nothing_is_not_waited_for_by_every_frame(has_spoken: bool) -> None:
+    """A camera of 30 Hz had less than 10 poses a second."""
+
+    async def scenario() -> None:
+        clock = ManualClock(1)
+        timed = timed_by_arrival(clock)
+        clock.advance_to(1000 * MS)
+        if has_spoken:
+            for boot_ms in (0, 20):
+                timed.take(AttitudeSample(1, 1, boot_ms, np.eye(3), "quaternion"))
+        clock.advance_to(2000 * MS)
+        waited = await waits_s(timed, 2000 * MS, 10)
+        assert min(waited[:3]) > 0.09
+        assert sum(waited[4:]) < 0.09
+
+    asyncio.run(scenario())
+
+
+def test_who_speaks_again_is_waited_for_again() -> None:
+    async def scenario() -> None:
+        clock = ManualClock(1)
+        timed = timed_by_arrival(clock)
+        await waits_s(timed, 2000 * MS, 5)
+        clock.advance_to(1980 * MS)
+        timed.take(AttitudeSample(1, 1, 1980, about_down(0.1), "quaternion"))
+        frame = asyncio.create_task(timed.at(2000 * MS, 5.0))
+        await asyncio.sleep(0.01)
+        assert not frame.done()
+        clock.advance_to(2000 * MS)
+        timed.take(AttitudeSample(1, 1, 2000, about_down(0.2), "quaternion"))
+        told = await frame
+        assert told is not None
+        assert heading_of(told.ned_from_body) == pytest.approx(0.2, abs=0.01)
+
+    asyncio.run(scenario())
+
+
+def test_a_slow_stream_is_not_taken_for_a_silent_one() -> None:
+    """At 2 Hz a frame's wait ends before the next attitude, four times of five."""
+
+    async def scenario() -> None:
+        clock = ManualClock(1)
+        timed = timed_by_arrival(clock)
+        for boot_ms in range(0, 3000, 500):
+            clock.advance_to((1000 + boot_ms) * MS)
+            timed.take(AttitudeSample(1, 1, boot_ms, np.eye(3), "quaternion"))
+        assert min(await waits_s(timed, 3900 * MS, 4)) > 0.09
+
+    asyncio.run(scenario())

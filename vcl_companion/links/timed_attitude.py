@@ -25,6 +25,9 @@ _SYNC_FAST_S, _SYNC_SLOW_S = 0.1, 1.0
 _SYNC_ENOUGH = 8
 # After this many unanswered questions (1 s) the autopilot does without TIMESYNC.
 _SYNC_GIVEN_UP = 10
+# After so many usual periods of waiting in vain, and within these bounds, s, attitudes are silent.
+_SILENT_PERIODS = 3.0
+_SILENT_S, _LONGEST_SILENT_S = 0.3, 1.0
 # A compass is taken in some seconds after the start.
 _FINDS_NORTH_MS = 20_000
 
@@ -62,6 +65,7 @@ class TimedAttitude:
         self._sync = TimesyncEstimator()
         self._asked_at_s = -math.inf
         self._news = asyncio.Event()
+        self._in_vain_s = 0.0
 
     @property
     def round_trip_s(self) -> float | None:
@@ -87,9 +91,11 @@ class TimedAttitude:
         Waits until a sample at or after the instant has come, ``wait_s`` at most,
         then takes what there is: None when nothing lies within the option
         ``max_attitude_age_s``, or while it is not known yet whose time is whose.
+        Who has waited in vain for a while waits no more until one comes: a camera's
+        rate must not fall to what an autopilot that says nothing leaves of it.
         """
         loop = asyncio.get_running_loop()
-        deadline_s = loop.time() + wait_s
+        deadline_s = loop.time() + (0.0 if self._is_silent else wait_s)
         while True:
             offset_ns = self.offset_ns(at_ns)
             if offset_ns is not None and self._history(at_ns, offset_ns).covers(at_ns, offset_ns):
@@ -103,6 +109,7 @@ class TimedAttitude:
                 async with asyncio.timeout(remaining_s):
                     await self._news.wait()
             except TimeoutError:
+                self._in_vain_s += remaining_s
                 break
         # A good moment to ask: in a replay the clocks of all processes stand together now.
         self._ask_if_due(_SYNC_SLOW_S)
@@ -145,6 +152,7 @@ class TimedAttitude:
 
         What was known of one before its restart is forgotten.
         """
+        self._in_vain_s = 0.0
         quaternion = sample.source == "quaternion"
         history = self._by_quaternion if quaternion else self._by_euler
         taken = history.add(sample, self._clock.now_ns())
@@ -167,6 +175,13 @@ class TimedAttitude:
     def ask_now(self) -> None:
         """Ask what time it is: a link has just come up."""
         self._ask_if_due(0.0)
+
+    @property
+    def _is_silent(self) -> bool:
+        # By the time waited: in a replay the clock leaps, and what it brings is still on its way.
+        rate_hz = max(self._by_quaternion.rate_hz, self._by_euler.rate_hz)
+        usual_s = _SILENT_PERIODS / rate_hz if rate_hz > 0.0 else 0.0
+        return self._in_vain_s >= min(max(usual_s, _SILENT_S), _LONGEST_SILENT_S)
 
     def _history(self, at_ns: int, offset_ns: int) -> AttitudeHistory:
         if self._by_quaternion.is_near(at_ns, offset_ns):
