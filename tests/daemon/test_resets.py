@@ -11,7 +11,12 @@ import pytest
 
 from vcl_companion.daemon.resets import ResetMode, Resets
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import euler_from_matrix, matrix_from_euler
+from vcl_companion.geometry.rotation import (
+    angle_between,
+    euler_from_matrix,
+    exp_so3,
+    matrix_from_euler,
+)
 from vcl_companion.links.vehicle_mode import VehicleMode
 
 S = 1_000_000_000
@@ -141,6 +146,21 @@ def test_what_is_told_slides_to_the_new_place_while_the_drone_flies_on() -> None
     arrived = next(k for k, (a, b) in enumerate(zip(told, truth, strict=True))
                    if a is not None and np.allclose(a.translation, b.translation))  # fmt: skip
     assert 75 <= arrived <= 90
+
+
+@pytest.mark.parametrize("pitch_deg", [20.0, 60.0, 80.0, 88.0, 89.9])
+def test_a_drone_that_dives_is_not_turned_by_a_slide(pitch_deg: float) -> None:
+    """It is found turned by 1.5 degrees, which are 30 of yaw at a pitch of 88."""
+    drone = Drone("blend")
+    steep = matrix_from_euler(0.02, math.radians(pitch_deg), 0.3)
+    there = Pose(steep, np.array([5.0, 0.0, 0.0]))
+    expected = Pose(steep @ exp_so3(np.deg2rad([1.0, 0.5, 1.0])), np.zeros(3))
+    drone.tells(expected)
+    told = drone.jumps(there, expected)
+    assert told is not None
+    assert np.linalg.norm(told.translation - expected.translation) < 0.1
+    assert angle_between(told.rotation, steep) < math.radians(1.5)
+    assert angle_between(told.rotation, expected.rotation) < math.radians(1.6)
 
 
 def test_a_slide_begins_and_ends_slowly_and_its_speed_is_told() -> None:

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array, about_down, euler_from_matrix
+from vcl_companion.geometry.rotation import Array, about_down, heading_of
 from vcl_companion.links.vehicle_mode import VehicleMode
 
 ResetMode = Literal["follow", "blend", "wait"]
@@ -135,7 +135,7 @@ class Resets:
         shift = self._shift
         before = shift @ pose
         turn_rad, self._now_rad_s = _slid(
-            _heading(shift.rotation), self._now_rad_s, self._turn_rad_s, since_s
+            heading_of(shift.rotation), self._now_rad_s, self._turn_rad_s, since_s
         )
         off = before.translation - pose.translation
         length_m = float(np.linalg.norm(off))
@@ -192,9 +192,11 @@ def _explains(pose: Pose, covariance: Array, expected: Pose) -> bool:
 
 
 def _shift_between(told: Pose, pose: Pose) -> Pose:
-    """Return what carries a pose to where another is, its roll and pitch as they are."""
-    turn_rad = _heading(told.rotation) - _heading(pose.rotation)
-    rotation = about_down(math.remainder(turn_rad, math.tau))
+    """Return what carries a pose to where another is, its roll and pitch as they are.
+
+    The turn is not the difference of two yaws: of who dives these tell of any small turn.
+    """
+    rotation = about_down(heading_of(told.rotation @ pose.rotation.T))
     return Pose(rotation, told.translation - rotation @ pose.translation)
 
 
@@ -216,7 +218,3 @@ def _slid(left: float, speed: float, most: float, since_s: float) -> tuple[float
     slowing = math.sqrt(half**2 + 2.0 * change * abs(left)) - half
     speed = min(speed + 2.0 * half, most, slowing)
     return math.copysign(max(abs(left) - speed * since_s, 0.0), left), speed
-
-
-def _heading(rotation: Array) -> float:
-    return euler_from_matrix(rotation)[2]
