@@ -153,26 +153,27 @@ def test_who_is_told_to_relocalize_looks_for_itself_anew(tmp_path: Path) -> None
     run(scenario())
 
 
-def test_a_command_whose_answer_was_lost_is_not_obeyed_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("unused", [0.0, float("nan")])
+def test_a_command_whose_answer_was_lost_is_not_obeyed_again(tmp_path: Path, unused: float) -> None:
     async def scenario() -> None:
         async with swarm(1, 2, path=tmp_path) as members:
             one = await members.start(1, update=QUIET)
             await one.see(demo.frame(1, 0))
             for confirmation, n_obeyed in ((0, 1), (1, 1), (2, 1), (0, 2)):
-                one.autopilot.forward(RELOCALIZE, confirmation=confirmation)
+                one.autopilot.forward(RELOCALIZE, unused, unused, confirmation=confirmation)
                 assert await last_answer(one) == (RELOCALIZE, ACCEPTED, 255)
                 assert len(one.events("command")) == n_obeyed
             # Of somebody else, or for something else, or long ago, it is another one.
-            one.autopilot.forward(RELOCALIZE, confirmation=1, system=1)
+            one.autopilot.forward(RELOCALIZE, unused, unused, confirmation=1, system=1)
             assert await last_answer(one) == (RELOCALIZE, ACCEPTED, 255)
             assert len(one.events("command")) == 3
-            one.autopilot.forward(PAUSE, 1.0, confirmation=3)
+            one.autopilot.forward(PAUSE, 1.0, unused, confirmation=3)
             assert await last_answer(one) == (PAUSE, ACCEPTED, 255)
-            one.autopilot.forward(PAUSE, 0.0, confirmation=1)
+            one.autopilot.forward(PAUSE, 0.0, unused, confirmation=1)
             assert await last_answer(one) == (PAUSE, ACCEPTED, 255)
             assert not one.autopilot_link.poses.is_paused
             await passes(3.0)
-            one.autopilot.forward(PAUSE, 0.0, confirmation=1)
+            one.autopilot.forward(PAUSE, 0.0, unused, confirmation=1)
             assert await last_answer(one) == (PAUSE, ACCEPTED, 255)
             assert len(one.events("command")) == 6
 

@@ -79,8 +79,9 @@ def test_a_reload_goes_back_to_the_saved_map_and_looks_for_the_drone_anew(tmp_pa
             one.maps.replace(NEXT, demo.update_index())
             await one.fly(2)
             n_resets = one.estimator.n_resets
-            one.autopilot.forward(RELOAD)
-            one.autopilot.forward(RELOAD, confirmation=1)
+            unused = float("nan")
+            one.autopilot.forward(RELOAD, unused, unused)
+            one.autopilot.forward(RELOAD, unused, unused, confirmation=1)
             one.autopilot.forward(SAVE)
             answers = [await one.autopilot.answers.get() for _ in range(3)]
             assert answers == [

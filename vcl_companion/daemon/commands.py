@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import struct
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 
@@ -72,8 +73,9 @@ class _Ended:
         return (
             its.confirmation > 0
             and now_s < self.at_s + _REPEATED_WITHIN_S
-            and (mine.sender_system, mine.sender_component, mine.parameters)
-            == (its.sender_system, its.sender_component, its.parameters)
+            and (mine.sender_system, mine.sender_component)
+            == (its.sender_system, its.sender_component)
+            and _packed(*mine.parameters) == _packed(*its.parameters)
         )
 
 
@@ -112,7 +114,7 @@ class Commands:
         self._log = log
         self._updating: asyncio.Task[None] | None = None
         self._storing: asyncio.Task[None] | None = None
-        self._stores = (0, 0.0)  # the command and the parameter of that
+        self._stores = (0, b"")  # the command and the parameter of that
         self._ended: dict[int, _Ended] = {}
         self.on_pause: Callable[[], None] | None = None
         """Called when a command has held poses back, or sent them again."""
@@ -209,8 +211,7 @@ class Commands:
             self._answer(message, RESULT_DENIED)
             return False
         if _is_going_on(self._storing):
-            order = message.command, message.parameters[0]
-            is_same = order == self._stores
+            is_same = self._stores == (message.command, _packed(message.parameters[0]))
             self._answer(message, RESULT_IN_PROGRESS if is_same else RESULT_TEMPORARILY_REJECTED)
             return False
         return True
@@ -218,7 +219,7 @@ class Commands:
     def _store(self, message: CommandLong, what: str, storing: Coroutine[None, None, bool]) -> None:
         self._note(message, what)
         self._answer(message, RESULT_IN_PROGRESS)
-        self._stores = message.command, message.parameters[0]
+        self._stores = message.command, _packed(message.parameters[0])
         self._storing = asyncio.create_task(self._stored(message, storing))
 
     async def _stored(self, message: CommandLong, storing: Coroutine[None, None, bool]) -> None:
@@ -263,6 +264,11 @@ class Commands:
             updating.cancel()  # it says itself that it was
         else:
             self._answer(message, RESULT_DENIED)
+
+
+def _packed(*parameters: float) -> bytes:
+    """Return parameters to be compared: unused ones may be NaN, which no NaN equals."""
+    return struct.pack(f"<{len(parameters)}d", *parameters)
 
 
 def _is_going_on(task: asyncio.Task[None] | None) -> bool:
