@@ -95,3 +95,20 @@ def test_a_restart_and_another_firmware_are_asked_again() -> None:
             await until(lambda: "EKF2_MAG_TYPE" in autopilot.asked)
 
     asyncio.run(scenario())
+
+
+def test_one_that_restarts_while_it_does_not_say_is_asked_at_once() -> None:
+    async def scenario() -> None:
+        autopilot = Autopilot()
+        source = HeadingSource(autopilot.parameter)
+        async with running(source.run()):
+            source.is_of(Firmware.ARDUPILOT)
+            await until(lambda: len(autopilot.asked) == 1)
+            for _ in range(10):
+                await asyncio.sleep(0)
+            autopilot.parameters["EK3_SRC1_YAW"] = 1.0
+            source.forget()
+            async with asyncio.timeout(1.0):  # else asked after a pause of two seconds, or more
+                await until(lambda: source.is_own)
+
+    asyncio.run(scenario())

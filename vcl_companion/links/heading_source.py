@@ -68,10 +68,12 @@ class HeadingSource:
                     what = "its own" if said else "what we tell it"
                     _log.info("the autopilot's heading is %s", what)
                     break
-                if self._changed.is_set():
+                try:
+                    async with asyncio.timeout(pause_s):
+                        await self._changed.wait()
                     break
-                await asyncio.sleep(pause_s)
-                pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)
+                except TimeoutError:
+                    pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)
 
     async def _asked(self) -> bool | None:
         """Return whether it has a heading of its own; None when it does not say."""
