@@ -289,9 +289,8 @@ class AutopilotLink:
 
     def _take_position(self, message: LocalPosition) -> None:
         self.origin.height_m = -float(message.position[2])
-        offset_ns = self.attitudes.offset_ns(self._clock.now_ns())
-        if offset_ns is not None:
-            measured_ns = message.time_boot_ms * 1_000_000 + offset_ns
+        measured_ns = self.attitudes.instant_ns(message.time_boot_ms)
+        if measured_ns is not None:
             self._fusion.believes(measured_ns, message.position, message.velocity)
 
     def _is_of(self, firmware: Firmware) -> None:

@@ -56,7 +56,8 @@ class AttitudeSample(Message):
     """An attitude by the autopilot's own clock.
 
     Attributes:
-        time_boot_ms: milliseconds since the autopilot's start, cut off, not rounded.
+        time_boot_ms: milliseconds since the autopilot's start, cut off, not rounded; 32 bits as
+            they come, more where ``BootClock`` has made them run on.
         ned_from_body: (3, 3) rotation.
         source: the message that it came in.
         body_rates_rad_s: (3,) how fast its gyros say that it turns about the body's axes;

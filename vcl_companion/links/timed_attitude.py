@@ -10,11 +10,13 @@ import asyncio
 import logging
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
 from vcl_companion.clock import Clock
 from vcl_companion.links.attitude import Attitude, AttitudeHistory
 from vcl_companion.links.autopilot_options import AutopilotOptions
+from vcl_companion.links.boot_clock import BootClock, instant_ns
 from vcl_companion.links.messages import AttitudeSample
 from vcl_companion.links.timesync import TimesyncEstimator
 
@@ -62,6 +64,7 @@ class TimedAttitude:
         self._is_told = is_told
         self._has_own_north = has_own_north
         self._has_restarted = False
+        self._boot_clock = BootClock()
         self._sync = TimesyncEstimator()
         self._asked_at_s = -math.inf
         self._news = asyncio.Event()
@@ -133,13 +136,21 @@ class TimedAttitude:
         return None if offset_ns is None else self._history(now_ns, offset_ns).newest_ns(offset_ns)
 
     def offset_ns(self, at_ns: int) -> int | None:
-        """Return our clock minus the autopilot's; None while its answer may still come."""
+        """Return our clock minus that of attitudes; None while an answer may still come."""
         offset_ns = self._sync.offset_ns(at_ns)
-        if offset_ns is None and self._sync.unanswered >= _SYNC_GIVEN_UP:
+        if offset_ns is not None:
+            return self._boot_clock.offset_ns(offset_ns, self._clock.now_ns())
+        if self._sync.unanswered >= _SYNC_GIVEN_UP:
             offset_ns = self._by_quaternion.offset_by_arrival_ns()
             if offset_ns is None:
                 offset_ns = self._by_euler.offset_by_arrival_ns()
         return offset_ns
+
+    def instant_ns(self, time_boot_ms: int) -> int | None:
+        """Return when another message that has just come was stamped; None: not known yet."""
+        now_ns = self._clock.now_ns()
+        offset_ns = self.offset_ns(now_ns)
+        return None if offset_ns is None else instant_ns(time_boot_ms, offset_ns, now_ns)
 
     def answered(self, asked_ns: int, theirs_ns: int) -> str | None:
         """Take the answer to a question in; return why it is refused, if it is."""
@@ -153,20 +164,24 @@ class TimedAttitude:
         What was known of one before its restart is forgotten.
         """
         self._in_vain_s = 0.0
+        now_ns = self._clock.now_ns()
+        is_young = sample.time_boot_ms < _FINDS_NORTH_MS
+        self._has_restarted = self._has_restarted and is_young
+        running_ms = self._boot_clock.running_ms(sample.time_boot_ms, now_ns)
+        sample = replace(sample, time_boot_ms=running_ms)
         quaternion = sample.source == "quaternion"
         history = self._by_quaternion if quaternion else self._by_euler
-        taken = history.add(sample, self._clock.now_ns())
+        taken = history.add(sample, now_ns)
         if taken == "turned":
             degrees = math.degrees(history.north_rad)
-            is_new = self._has_restarted and sample.time_boot_ms < _FINDS_NORTH_MS
-            is_new = is_new and self._has_own_north()
+            is_new = self._has_restarted and self._has_own_north()
             if self._is_told() and not is_new:
                 _log.info("the autopilot has turned its north, by %.1f degrees so far", degrees)
             else:
                 history.take_its_north()
                 _log.info("the autopilot has found its north, by %.1f degrees", degrees)
         elif taken == "rebooted":
-            self._has_restarted = True
+            self._has_restarted = is_young
             self._sync.reset()
             (self._by_euler if quaternion else self._by_quaternion).clear()
         self._wake()
