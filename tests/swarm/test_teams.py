@@ -34,6 +34,7 @@ def test_of_two_drones_none_takes_an_epoch_of_the_other() -> None:
     a, b = Epochs(3), Epochs(4)
     assert a.take(0) != b.take(0)
     assert (taken_by(a.of(0)), taken_by(b.of(0))) == (3, 4)
+    assert (taken_by(FIRST), taken_by(VACANT)) == (0, 0)
     assert a.is_ours(0)
     a.hear(0, b.of(0))
     assert not a.is_ours(0)

@@ -7,8 +7,11 @@ heard and then lost, the lowest member alive that is believed. A leader never
 heard is waited for, but not for ever: at a start drones come up seconds apart, and
 each must not begin a map of its own.
 
+Who goes and comes back again and again does not lead at once (``comebacks``).
+
 Whoever begins to coordinate takes an epoch (``epochs``); one who does it under an
-older one, for it was away, is not followed until it has taken a newer one. A drone
+older one, for it was away, is not followed until it has taken a newer one. That one is
+older is believed of who coordinates, or of two, and never of one other alone. A drone
 that was restarted waits for the time-out before it holds anybody for lost that
 it has not heard itself: until then it knows neither who is there nor the epochs.
 """
@@ -19,7 +22,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from vcl_companion.errors import ConfigError
-from vcl_companion.swarm.epochs import FIRST, VACANT, Epochs, is_before, taken_by
+from vcl_companion.swarm.comebacks import Comebacks, successor
+from vcl_companion.swarm.epochs import FIRST, VACANT, Epochs, is_before, lower, taken_by
 from vcl_companion.swarm.overlap import OverlapGraph, OverlapOptions, OwnSignature
 from vcl_companion.swarm.pace import stretch_of
 from vcl_companion.swarm.presence import Presence
@@ -74,6 +78,7 @@ class Group:
         # Asked for with every message, and changed by hardly any; None: to be found anew.
         self._teammates: tuple[int, ...] | None = None
         self._epochs = Epochs(own_id)
+        self._comebacks = Comebacks()
         overlaps = OverlapOptions().at_pace(stretch_of(len(self.members)))
         self._graph = OverlapGraph(self.members, overlaps)
         self._parting = Parting(self._graph, options.split_after_s)
@@ -116,10 +121,9 @@ class Group:
     @property
     def coordinator(self) -> int:
         """The member of our team that builds and hands out maps; see the module."""
-        team = self.teammates
-        if self.leader in team or self._awaits_leader:
+        if self._awaits_leader and self.leader not in self.teammates:
             return self.leader
-        return next(member for member in team if member not in self._distrusted)
+        return self._rightful(self._team, self.teammates) or self.own_id
 
     @property
     def is_coordinator(self) -> bool:
@@ -203,10 +207,7 @@ class Group:
         """Return who coordinates a team, None where nobody of it is there and believed."""
         if team == self._team:
             return self.coordinator
-        members = [m for m in self.alive if self.team_of(m) == team]
-        if self.leader in members:
-            return self.leader
-        return next((m for m in members if m not in self._distrusted), None)
+        return self._rightful(team, self._members_of(team))
 
     def join(self, team: int) -> None:
         """Fly with a team from now on: its map has been taken."""
@@ -228,6 +229,7 @@ class Group:
         if not self._presence.hear(peer, now_s):
             return []
         self._teammates = None
+        self._comebacks.came(peer, now_s)
         self._take_term()
         return [PeerJoined(peer)]
 
@@ -241,8 +243,10 @@ class Group:
         self._states[peer] = state
         if state.team != before.team:
             self._teammates = None
+        if _was_restarted(state, before):
+            self._comebacks.restarted(peer, now_s)
         if peer not in self._distrusted:
-            self._epochs.hear(state.team, state.epoch)
+            self._hear_epoch(peer, state)
             self._graph.note(peer, state.signature, now_s)
         if has_moved:
             self._go_to(state.team)
@@ -355,6 +359,7 @@ class Group:
         for peer in lost:
             self._states.pop(peer, None)
             self._teammates = None
+            self._comebacks.lost(peer, now_s)
             self._graph.forget(peer)
         self._graph.poll(now_s)
         roster = self._roster()
@@ -373,7 +378,8 @@ class Group:
         """Whether the leader, which nobody has lost yet, may still come to our team."""
         if self._team != 0 or self._is_leader_gone:
             return False
-        return self.epoch == FIRST or not self._presence.has_listened
+        # That it was lost is believed of anybody: nobody that is there is kept from leading by it.
+        return self._epochs.is_unheard_of(0) or not self._presence.has_listened
 
     @property
     def _is_leader_gone(self) -> bool:
@@ -391,16 +397,79 @@ class Group:
         state = self._states.get(member)
         return state is not None and state.team == self._team and taken_by(state.epoch) == member
 
+    def _rightful(self, team: int, members: tuple[int, ...]) -> int | None:
+        """Return who leads a team of these members, whoever else may come; None for nobody."""
+        if self.leader in members and self._is_settled(self.leader):
+            return self.leader
+        believed = [m for m in members if m not in self._distrusted]
+        order = [self.leader, *believed] if self.leader in members else believed
+        for member in order:
+            if self._is_settled(member):
+                return member
+            told = {m: self._epoch_told(m, team) for m in believed if m != member}
+            other = successor(told)
+            if other is not None:
+                return other
+            if not self._comebacks.has_restarted(member):
+                return member
+        return next(iter(order), None)
+
+    def _is_settled(self, member: int) -> bool:
+        return self._comebacks.is_settled(member, self._presence.now_s)
+
+    def _members_of(self, team: int) -> tuple[int, ...]:
+        if team == self._team:
+            return self.teammates
+        return tuple(m for m in self.alive if self.team_of(m) == team)
+
+    def _epoch_told(self, member: int, team: int) -> int:
+        """Return the highest epoch of its team that a member of it says that it knows."""
+        if member == self.own_id:
+            return self._epochs.of(team)
+        state = self._states.get(member)
+        return state.epoch if state else FIRST
+
+    def _hear_epoch(self, peer: int, state: MapState) -> None:
+        """Take what a peer says of its team's epoch: whom to believe, see ``epochs``.
+
+        Who coordinates takes a newer one for whatever anybody has heard of: to the one who has,
+        it is one that was away.
+        """
+        epochs, team, epoch = self._epochs, state.team, state.epoch
+        if not is_before(epochs.of(team), epoch):
+            return
+        members = self._members_of(team)
+        lead = self._rightful(team, members)
+        if peer == lead:
+            epochs.hear(team, epoch)
+            return
+        taker = taken_by(epoch)
+        # Who comes back too often takes epochs for a place that it is not let to.
+        if taker not in (lead, self.own_id) and taker in members and not self._is_settled(taker):
+            return
+        epochs.rumour(team, epoch)
+        for other in members:
+            if other not in (peer, self.own_id) and other not in self._distrusted:
+                told = self._epoch_told(other, team)
+                # Of what it said before, none would be a lower one by half of all epochs.
+                if is_before(epochs.of(team), told) and is_before(epochs.of(team), epoch):
+                    epochs.hear(team, lower(epoch, told))
+        if team == self._team and self.is_coordinator and is_before(epochs.of(team), epoch):
+            epochs.take(team)
+
     def _go_to(self, team: int) -> None:
         if team != self._team:
             self._team, self._teammates = team, None
 
     def _take_term(self) -> None:
         """Take an epoch when this drone has begun to coordinate, or hears of a newer one."""
-        # It may be there, and fly with another team.
-        if self._team == 0 and self._is_leader_gone and self.leader not in self.teammates:
+        lead = self.coordinator
+        # It may be there, and fly with another team, or be passed over.
+        if self._team == 0 and lead != self.leader:
             self._epochs.hear(0, VACANT)
-        if not self.is_coordinator or self._epochs.is_ours(self._team):
+        # It may have taken one before we held it for the one to lead.
+        self._epochs.hear(self._team, self._epoch_told(lead, self._team))
+        if lead != self.own_id or self._epochs.is_ours(self._team):
             return
         if self._team != 0 or self.epoch != FIRST:
             self._epochs.take(self._team)
@@ -432,3 +501,9 @@ class Group:
             {m for m, state in mapped.items() if state.localized and not state.wants_update},
             coordinator if coordinator in believed else None,
         )
+
+
+def _was_restarted(state: MapState, before: MapState) -> bool:
+    """Whether a member that says this after that has forgotten its map, or its team's epochs."""
+    has_forgotten = before.epoch > VACANT and state.epoch == FIRST and before.team == state.team
+    return has_forgotten or bool(before.revision and not state.revision)
