@@ -12,6 +12,8 @@ from vcl_companion.swarm.group import Group
 _ACQUAINTED_S = 0.5
 # Nobody needs longer than so many times the patience to hand over a map, whatever trickles in.
 _MAX_DELIVERIES = 10.0
+# Who says so anew was away, or is wrong: it uses up so much of the patience each time.
+_NEW_CLAIM = 0.1
 
 
 class FirstMapTurn:
@@ -38,7 +40,10 @@ class FirstMapTurn:
         self._is_receiving_map = is_receiving_map
         self._member_wait_s = member_wait_s
         self._delivery_wait_s = delivery_wait_s
-        self._claimed_since_s: float | None = None
+        # For how long each has said in all that it has a map, and who did at the last look.
+        self._claimed_s: dict[int, float] = {}
+        self._claiming: frozenset[int] = frozenset()
+        self._looked_at_s = 0.0
         self._complete_since_s: float | None = None
 
     def is_due(self, began_at_s: float) -> bool:
@@ -64,15 +69,19 @@ class FirstMapTurn:
     def has_map(self) -> bool:
         """Whether there is a map: ours, or of a peer, which will send it (we are late, or back).
 
-        Not for ever: a peer that has said so for long and sends none has none to give.
+        Not for ever: a peer that has said so for long and sends none has none to give, though it
+        said nothing of the kind now and then.
         """
+        if self._maps.current is not None:
+            return True
         now_s = asyncio.get_running_loop().time()
-        states = map(self._group.state_of, self._group.peers)
-        if not any(state is not None and state.revision for state in states):
-            self._claimed_since_s = None
-        elif self._claimed_since_s is None:
-            self._claimed_since_s = now_s
-        if self._maps.current is not None or self._claimed_since_s is None:
-            return self._maps.current is not None
-        waited = (now_s - self._claimed_since_s) / self._delivery_wait_s
-        return waited < (_MAX_DELIVERIES if self._is_receiving_map() else 1.0)
+        group = self._group
+        claiming = frozenset(p for p in group.trusted if p != group.own_id and group.has_map(p))
+        for peer in claiming & self._claiming:
+            self._claimed_s[peer] += now_s - self._looked_at_s
+        for peer in claiming - self._claiming:
+            anew_s = _NEW_CLAIM * self._delivery_wait_s
+            self._claimed_s[peer] = self._claimed_s.get(peer, -anew_s) + anew_s
+        self._claiming, self._looked_at_s = claiming, now_s
+        patience_s = self._delivery_wait_s * (_MAX_DELIVERIES if self._is_receiving_map() else 1.0)
+        return any(self._claimed_s[peer] < patience_s for peer in claiming)
