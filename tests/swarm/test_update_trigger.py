@@ -10,6 +10,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from vcl_companion.swarm.awaited import Awaited
 from vcl_companion.swarm.group import Group, SwarmOptions
 from vcl_companion.swarm.own_vote import OwnVote, Sight
 from vcl_companion.swarm.update_options import UpdateOptions
@@ -85,7 +86,7 @@ class Sky:
 
     def start(self, own_id: int, revision: bytes = FIRST) -> Member:
         group = Group(SwarmOptions(members=self.ids), own_id)
-        trigger = UpdateTrigger(self.options, group)
+        trigger = UpdateTrigger(self.options, group, Awaited(group, self.options.delivery_wait_s))
         self.members[own_id] = Member(group, OwnVote(self.options), trigger, revision)
         return self.members[own_id]
 

@@ -12,6 +12,7 @@ from vcl_companion.localization.outlook import novelty_from
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.novelty import NEAR_DEG
 from vcl_companion.mapping.options import NoMap
+from vcl_companion.swarm.awaited import Awaited
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.pace import look_s
 from vcl_companion.swarm.update_options import UpdateOptions
@@ -28,7 +29,8 @@ class MapExtension:
     """Extends the map in use by the frames of a round, in up to two revisions.
 
     Args:
-        group: whether we are still the ones to make it, and who lacks it.
+        group: whether we are still the ones to make it.
+        awaited: who is waited for to have it.
         maps: the map in use.
         building: of the revisions.
         decide: takes each of them.
@@ -40,6 +42,7 @@ class MapExtension:
     def __init__(
         self,
         group: Group,
+        awaited: Awaited,
         maps: MapStore,
         building: RoundBuilding,
         decide: Decide,
@@ -48,6 +51,7 @@ class MapExtension:
         by_patches: bool,
     ) -> None:
         self._group = group
+        self._awaited = awaited
         self._maps = maps
         self._building = building
         self._decide = decide
@@ -139,9 +143,11 @@ class MapExtension:
         return _has_new_places(built, stored.index.landmark_map, self._options.novelty_deg)
 
     async def _delivered(self, stored: StoredMap) -> None:
-        """Wait until everybody alive has a revision, as long as a round would."""
+        """Wait until everybody who is waited for has a revision, as long as a round would."""
         until_s = self._now_s() + self._options.delivery_wait_s
-        while self._group.lacking() and not self.is_past(stored) and self._now_s() < until_s:
+        while (now_s := self._now_s()) < until_s and not self.is_past(stored):
+            if not self._awaited.look(now_s):
+                break
             await asyncio.sleep(look_s(self._group.stretch))
 
     async def _is_wanted_again(self, stored: StoredMap) -> bool:

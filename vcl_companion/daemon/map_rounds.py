@@ -34,6 +34,7 @@ from vcl_companion.localization.detail import Detail
 from vcl_companion.mapping.contributing import without_alike
 from vcl_companion.mapping.options import MapOptions, NoMap
 from vcl_companion.mapping.reconstruction import lacks
+from vcl_companion.swarm.awaited import Awaited
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.pace import look_s
 from vcl_companion.swarm.update_options import UpdateOptions
@@ -136,10 +137,18 @@ class MapRounds:
         gathering = Gathering(group, ask, clock, clocks, rng)
         self._round_frames = RoundFrames(group, frames, describe, gathering, passed)
         self._building = RoundBuilding(work)
+        self._awaited = Awaited(group, options.update.delivery_wait_s)
         self._extension = MapExtension(
-            group, maps, self._building, decide, passed, options.update, options.map.patches
+            group,
+            self._awaited,
+            maps,
+            self._building,
+            decide,
+            passed,
+            options.update,
+            options.map.patches,
         )
-        self._trigger = UpdateTrigger(options.update, group)
+        self._trigger = UpdateTrigger(options.update, group, self._awaited)
         self._tried: Frame | None = None
         self.is_asked = False
         """Whether the ground wants an update: whoever coordinates makes it at once."""
@@ -194,8 +203,9 @@ class MapRounds:
     def _is_due(self) -> bool:
         if self._is_merging():
             return False
-        asked = self.is_asked and self._group.is_coordinator and not self._group.lacking()
-        return asked or self._trigger.is_due(self._now_s())
+        now_s = self._now_s()
+        asked = self.is_asked and self._group.is_coordinator and not self._awaited.look(now_s)
+        return asked or self._trigger.is_due(now_s)
 
     def _is_stale(self, frame: Frame) -> bool:
         return self._clock.now_ns() - frame.captured_at_ns > _STALE_NS

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 
+from vcl_companion.swarm.awaited import Awaited
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.update_options import UpdateOptions
 
@@ -71,11 +72,13 @@ class UpdateTrigger:
     Args:
         options: the same on every drone.
         group: who votes for what; the trigger only looks.
+        awaited: who is waited for to have the last one.
     """
 
-    def __init__(self, options: UpdateOptions, group: Group) -> None:
+    def __init__(self, options: UpdateOptions, group: Group, awaited: Awaited) -> None:
         self._options = options
         self._group = group
+        self._awaited = awaited
         self._wanted_since_s: float | None = None
         self._revision = b""
         self._revision_since_s = 0.0
@@ -98,7 +101,8 @@ class UpdateTrigger:
         elif self._wanted_since_s is None:
             self._wanted_since_s = now_s
         # Who does not have the newest revision has not judged it.
-        if group.majority_wants_update or group.lacking():
+        awaited = self._awaited.look(now_s)  # at every look: it counts for how long
+        if group.majority_wants_update or awaited:
             self._content_since_s = math.inf
         else:
             self._content_since_s = min(self._content_since_s, now_s)
@@ -123,7 +127,8 @@ class UpdateTrigger:
         pause_s = options.interval_s * min(2.0**in_vain, _MAX_PAUSE)
         if now_s < max(self._ended_at_s, self._revision_since_s) + pause_s:
             return False
-        return not group.lacking() or now_s >= self._revision_since_s + options.delivery_wait_s
+        has_waited = now_s >= self._revision_since_s + options.delivery_wait_s
+        return has_waited or not self._awaited.look(now_s)
 
     @property
     def is_coming(self) -> bool:
