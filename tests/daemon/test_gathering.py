@@ -124,3 +124,98 @@ def test_a_frame_that_answers_for_several_instants_counts_once() -> None:
         assert [f.captured_at_ns for f in frames] == [NOW_NS - 3 * SECOND]
 
     run(scenario())
+
+
+class Rounds:
+    """Drone 1's rounds, in which drones 2 and 3 answer after so long, or never (None)."""
+
+    def __init__(self, **answers_after_s: float | None) -> None:
+        self.answers_after_s = answers_after_s
+        self.now_s = asyncio.get_running_loop().time
+        self.group, clock = Group(SwarmOptions((1, 2, 3)), 1), ManualClock(NOW_NS)
+        self.hear()
+        clocks = PeerClocks(
+            self.group, lambda *_: None, clock, FlightLog("", clock), lambda *_: None, 0
+        )
+        self.gathering = Gathering(self.group, self._asked, clock, clocks, np.random.default_rng(0))
+        self.refused: list[str | None] = []
+
+    def hear(self, *peers: int) -> None:
+        for peer in peers or (2, 3):
+            self.group.heartbeat(peer, self.now_s())
+
+    def _asked(self, request: FrameRequest, peer: int) -> None:
+        after_s = self.answers_after_s[f"drone_{peer}"]
+        if after_s is not None:
+            frame = replace(answer(request.request_id, 0.1, is_placed=False), drone_id=peer)
+            asyncio.get_running_loop().call_later(after_s, self._answer, peer, frame)
+
+    def _answer(self, peer: int, frame: FrameAnswer) -> None:
+        self.refused.append(self.gathering.take(peer, frame))
+
+    async def round_s(self, *, needs_others: bool = False) -> tuple[float, list[int]]:
+        """Make one; return how long it took, and whose frames came."""
+        self.gathering.begin()
+        began_at_s, frames = self.now_s(), list[FrameAnswer]()
+        wanted = Wanted(NOW_NS, (1, 2, 3), timeout_s=5.0, needs_others=needs_others)
+
+        async def gather() -> None:
+            frames.extend(await self.gathering.gather(wanted, lambda: False))
+
+        gathering = asyncio.create_task(gather())
+        while not gathering.done():
+            await passes(0.25)
+        return self.now_s() - began_at_s, sorted(frame.drone_id for frame in frames)
+
+
+def test_who_never_answers_makes_one_round_long_and_not_each() -> None:
+    async def scenario() -> None:
+        rounds = Rounds(drone_2=0.1, drone_3=None)
+        assert (await rounds.round_s())[0] >= 5.0
+        for _ in range(3):
+            took_s, drones = await rounds.round_s()
+            assert took_s < 2.0
+            assert drones == [2]
+        rounds.answers_after_s["drone_3"] = 0.3  # it is still asked, and has a moment
+        took_s, drones = await rounds.round_s()
+        assert took_s < 2.0
+        assert drones == [2, 3]
+        rounds.answers_after_s["drone_3"] = 3.0  # and has all the time from then on
+        assert (await rounds.round_s())[1] == [2, 3]
+
+    run(scenario())
+
+
+def test_who_answers_too_late_is_waited_for_again() -> None:
+    async def scenario() -> None:
+        rounds = Rounds(drone_2=0.1, drone_3=5.5)
+        assert (await rounds.round_s())[1] == [2]
+        await passes(1.0)
+        assert rounds.refused.count("frame nobody asked for") >= 1
+        rounds.answers_after_s["drone_3"] = 4.0
+        assert (await rounds.round_s())[1] == [2, 3]
+
+    run(scenario())
+
+
+def test_where_nobody_has_answered_all_are_waited_for_if_one_frame_is_none() -> None:
+    async def scenario() -> None:
+        rounds = Rounds(drone_2=None, drone_3=None)
+        assert (await rounds.round_s(needs_others=True))[0] >= 5.0
+        assert (await rounds.round_s(needs_others=True))[0] >= 5.0
+        assert (await rounds.round_s())[0] < 2.0
+
+    run(scenario())
+
+
+def test_who_was_away_is_waited_for_again() -> None:
+    async def scenario() -> None:
+        rounds = Rounds(drone_2=0.1, drone_3=None)
+        await rounds.round_s()
+        rounds.group.poll(rounds.now_s())  # both are lost
+        rounds.hear(2)
+        assert (await rounds.round_s())[0] < 2.0
+        rounds.hear(3)
+        assert (await rounds.round_s())[0] >= 5.0
+
+    run(scenario())

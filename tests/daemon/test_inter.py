@@ -18,6 +18,7 @@ from tests.daemon.waiting import passes, run, until
 from vcl_companion.daemon.estimator import HISTORY_S
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.swarm.pose_requests import HostChoice
 from vcl_companion.swarm.transfer import BlobKind
 from vcl_companion.wire.map_codec import revision_of
 from vcl_companion.wire.messages import MapState
@@ -217,9 +218,11 @@ def test_a_late_proposal_is_fused_at_its_own_time(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("is_heard_of", [True, False])
 def test_a_proposal_older_than_the_history_is_refused_and_the_log_says_why(
-    tmp_path: Path, is_heard_of: bool
+    tmp_path: Path, is_heard_of: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its frame is forgotten; and, later still, so is that it was asked for."""
+    in_vain: list[int] = []
+    monkeypatch.setattr(HostChoice, "unanswered", lambda _, host, *__: in_vain.append(host))
 
     async def scenario() -> None:
         async with swarm(1, 2, path=tmp_path) as members:
@@ -238,6 +241,7 @@ def test_a_proposal_older_than_the_history_is_refused_and_the_log_says_why(
                     await passes(PATIENT.wait_s)
                     await two.server.answered()
                     await passes(HISTORY_S + 0.5)
+                assert in_vain == ([] if is_heard_of else [1])
                 before = drone.estimator.predicted(demo.shot(2, 29).at_ns, None)
                 stranger.say(proposal(second, demo.world_from_body(2, 1)), 2)
                 if is_heard_of:

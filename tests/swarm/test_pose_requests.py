@@ -51,6 +51,38 @@ def test_everybody_is_tried_then_the_surest_and_the_others_in_turn() -> None:
     assert choice.choose(MAP, 1) == [2]  # back, and a new one
 
 
+@pytest.mark.parametrize("at_once", [1, 2])
+def test_who_never_answers_is_asked_in_turn_with_those_who_cannot_tell(at_once: int) -> None:
+    """Asked when there was no other one, it would be the first for ever."""
+    choice = HostChoice(group_of(1, 2, 3))
+    asked = []
+    for n in range(60):
+        hosts = choice.choose(MAP, at_once)
+        asked += hosts
+        for host in hosts:
+            if host == 1:
+                choice.unanswered(host, math.inf, n * SECOND)
+            else:
+                choice.answered(host, 0.05, math.inf, n * SECOND)
+    assert asked.count(1) == 1
+    assert asked[at_once * 10 :].count(2) > 0
+    choice = HostChoice(group_of(1, 2))
+    assert [choice.choose(MAP, 1) for _ in range(4)] == [[1], [2], [1], [2]]  # none yet
+
+
+def test_who_was_sure_and_answers_no_more_is_not_the_first_any_more() -> None:
+    choice = HostChoice(group_of(1, 2))
+    choice.choose(MAP, 2)
+    choice.answered(1, 0.01, math.inf, 0)
+    choice.answered(2, 0.1, math.inf, 0)
+    assert choice.choose(MAP, 1) == [1]
+    choice.unanswered(1, math.inf, 2 * SECOND)
+    assert choice.choose(MAP, 1) == [2]
+    choice.answered(1, 0.01, math.inf, 9 * SECOND)
+    choice.unanswered(1, math.inf, 4 * SECOND)  # of a request before
+    assert choice.choose(MAP, 1) == [1]
+
+
 def test_only_who_was_surer_of_us_lately_may_know_better() -> None:
     choice = HostChoice(group_of(1, 2))
 

@@ -20,6 +20,11 @@ _ASK_AGAIN_S = 1.0
 # Earlier frames are a help, not a condition: who has none does not answer, and is not waited for.
 _EARLIER_WAIT_S = 2.0
 _IDS_A_ROUND = 16
+# Who has not answered a whole round at all is given this long in the next ones, when all others
+# have answered: it may have no camera, and each round would last for all of its time.
+_DUMB_WAIT_S = 1.0
+# An answer that comes up to so many rounds late is one as well: a slow link is waited for again.
+_ROUNDS_LATE = 64
 
 
 @dataclass(frozen=True)
@@ -33,6 +38,7 @@ class Wanted:
         spacing_s: time between a member's frames.
         timeout_s: how long to wait for all of them.
         furthest_ns: from its instant a frame may be, if it says where it was taken.
+        needs_others: whether there is nothing to be made of our own frame alone.
     """
 
     at_ns: int
@@ -41,6 +47,7 @@ class Wanted:
     spacing_s: float = 1.0
     timeout_s: float = 20.0
     furthest_ns: int = FURTHEST_NS
+    needs_others: bool = False
 
     def instant_ns(self, n: int) -> int:
         """Return the instant of a member's n-th frame, our clock."""
@@ -83,6 +90,7 @@ class Gathering:
         self._first_id = int(rng.integers(1 << 32))
         self._peers: dict[int, _FromPeer] | None = None  # None between rounds
         self._wanted: Wanted | None = None  # None until they are asked
+        self._dumb: set[int] = set()  # who has answered nothing since a round waited for it in vain
         self._came = asyncio.Event()
 
     @property
@@ -92,6 +100,8 @@ class Gathering:
 
     def take(self, peer: int, frame: FrameAnswer) -> str | None:
         """Take a peer's frame; return why it is refused, if it is."""
+        if 0 < (self._first_id - frame.request_id) % (1 << 32) <= _ROUNDS_LATE * _IDS_A_ROUND:
+            self._dumb.discard(peer)
         if self._peers is None or frame.drone_id != peer or peer not in self._peers:
             return "frame nobody asked for"
         sent = self._peers[peer]
@@ -100,6 +110,7 @@ class Gathering:
             return "frame nobody asked for"
         if self._is_of_another_instant(peer, frame, len(sent.frames)):
             return "frame of another instant than the one asked for"
+        self._dumb.discard(peer)
         sent.frames.append(frame)
         sent.asked_at_s = sent.since_s = float("-inf")
         self._came.set()
@@ -120,16 +131,22 @@ class Gathering:
         """
         assert self._peers is not None, "a round has not begun"
         self._wanted = wanted
-        with suppress(TimeoutError):
+        self._dumb.intersection_update(self._group.alive)  # who comes back begins anew
+        began_at_s = self._now_s()
+        open_: list[int] = []
+        try:
             async with asyncio.timeout(wanted.timeout_s):
                 while not is_over():
                     believed = set(self._group.trusted).intersection(wanted.members)
                     open_ = [peer for peer in sorted(believed) if self._is_open(peer, wanted)]
-                    if not open_:
+                    has_waited = self._now_s() >= began_at_s + _DUMB_WAIT_S
+                    if not open_ or (has_waited and self._is_enough(open_, wanted)):
                         break
                     for peer in open_:
                         self._ask_for_next(peer, wanted)
                     await self._news()
+        except TimeoutError:
+            self._dumb.update(peer for peer in open_ if not self._peers[peer].frames)
         came = [frame for sent in self._peers.values() for frame in sent.frames]
         self._peers = None
         # Who is lost may have one frame for several instants: the last that had a fix.
@@ -161,6 +178,12 @@ class Gathering:
         if len(sent.frames) > wanted.earlier.get(member, 0):
             return False
         return sent.since_s == float("-inf") or self._now_s() < sent.since_s + _EARLIER_WAIT_S
+
+    def _is_enough(self, open_: list[int], wanted: Wanted) -> bool:
+        """Whether what has come is worth a round without those who do not answer."""
+        assert self._peers is not None
+        has_others = any(sent.frames for sent in self._peers.values())
+        return self._dumb.issuperset(open_) and (has_others or not wanted.needs_others)
 
     def _ask_for_next(self, peer: int, wanted: Wanted) -> None:
         assert self._peers is not None

@@ -216,6 +216,8 @@ class InterTarget:
         finally:
             self._asked.pop(asked.request_id, None)
             self._given_up.extend((asked.request_id, host) for host in sorted(asked.waiting))
+            for host in asked.waiting:
+                self._hosts.unanswered(host, asked.sigma_m, asked.frame.captured_at_ns)
 
     def take(self, peer: int, answer: PoseProposal | PoseRefused) -> str | None:
         """Take a host's answer.

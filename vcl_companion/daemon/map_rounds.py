@@ -220,7 +220,10 @@ class MapRounds:
             (origin, *group.measured), self._options.update.contributors
         )
         wanted = Wanted(
-            frame.captured_at_ns, contributors, timeout_s=self._options.map.gather_timeout_s
+            frame.captured_at_ns,
+            contributors,
+            timeout_s=self._options.map.gather_timeout_s,
+            needs_others=True,
         )
         frames = await self._round_frames.gathered(
             frame, wanted, self._turn.has_map, passes_on=False

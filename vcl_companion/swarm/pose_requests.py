@@ -90,6 +90,7 @@ class HostChoice:
     def __init__(self, group: Group) -> None:
         self._group = group
         self._told: dict[int, _Answer] = {}
+        self._answered_at_ns: dict[int, int] = {}
         self._asked_in: dict[int, int] = {}
         self._n_requests = 0
 
@@ -97,7 +98,8 @@ class HostChoice:
         """Return the peers to ask now for a pose in a map.
 
         First those that were never asked, then the surest of those who answered,
-        then those who could not tell, the one that was not asked for longest first.
+        then those who could not tell, or have not answered yet: the one that was not asked for
+        longest first.
         """
         able = self._able(revision)
         silent = self._group.is_silent
@@ -130,6 +132,7 @@ class HostChoice:
             at_ns: when.
         """
         former = self._told.get(peer)
+        self._answered_at_ns[peer] = at_ns
         share: float | None = None
         if math.isinf(sigma_m):
             share = math.inf
@@ -140,9 +143,18 @@ class HostChoice:
             share, at_ns = former.share, former.at_ns
         self._told[peer] = _Answer(sigma_m, share, at_ns)
 
+    def unanswered(self, peer: int, own_sigma_m: float, asked_at_ns: int) -> None:
+        """Note that a peer has not answered in time: as one that could not tell.
+
+        What it has said since it was asked stands.
+        """
+        if self._answered_at_ns.get(peer, asked_at_ns) <= asked_at_ns:
+            self.answered(peer, math.inf, own_sigma_m, asked_at_ns)
+
     def lost(self, peer: int) -> None:
         """Forget a peer: when it comes back it is a new one."""
         self._told.pop(peer, None)
+        self._answered_at_ns.pop(peer, None)
         self._asked_in.pop(peer, None)
 
     def _may(self, peer: int, at_ns: int, is_weak: bool) -> bool:
@@ -155,7 +167,9 @@ class HostChoice:
 
     def _sigma_m(self, peer: int) -> float:
         told = self._told.get(peer)
-        return 0.0 if told is None else told.sigma_m
+        if told is None:
+            return math.inf if peer in self._asked_in else 0.0
+        return told.sigma_m
 
     def _able(self, revision: bytes) -> list[int]:
         """Return the peers that see a map, and are believed.
