@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tests.daemon import demo
+from tests.daemon.bent import bent
 from tests.daemon.swarm import Drone, swarm
 from tests.daemon.waiting import computed, hurry, run, until
 from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.local_frame import origin_in_leaders_world
 from vcl_companion.daemon.map_branches import way_into
-from vcl_companion.daemon.map_building import update_map
+from vcl_companion.daemon.map_building import build_map, update_map
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.localization.map_index import index_map
 from vcl_companion.mapping.keyframe_image import encode_image
-from vcl_companion.mapping.landmark_map import LandmarkMap
+from vcl_companion.mapping.landmark_map import JoinedMap, LandmarkMap
+from vcl_companion.swarm.transfer import BlobKind
 from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
 
 PAIR, ALL = demo.encoded_map(1, 2), demo.encoded_map(1, 2, 3)
@@ -163,6 +167,78 @@ def test_what_cannot_be_merged_stays_in_its_own_world_and_it_is_said_why(tmp_pat
             assert three.estimator.n_resets == 0
 
     run(scenario())
+
+
+def of_another_world(landmark_map: LandmarkMap, there: Similarity) -> bytes:
+    """A map that says that of all three is joined in it, and has no keyframe of that."""
+    name = revision_of(ALL)
+    said = replace(
+        landmark_map, parent=b"parent!!", world=b"world!!!", joined=(JoinedMap(name, name, there),)
+    )
+    return encode_map(said)
+
+
+@pytest.mark.parametrize("sees", [True, False])
+def test_what_a_map_says_of_where_our_world_lies_is_taken_if_a_frame_of_ours_shows_it(
+    tmp_path: Path, sees: bool
+) -> None:
+    """It was extended until it had nothing of ours any more; or somebody lies."""
+    frames = [demo.answer(system_id, 12) for system_id in (1, 2, 3)]
+    distances = demo.known_distances(1, 2)
+    later = build_map(frames, 1, distances, demo.MAP_OPTIONS, FeatureMemory(demo.FEATURES))
+    assert isinstance(later, LandmarkMap)
+    first = later.keyframes[0]
+    step = first.world_from_body @ demo.world_from_body(1, 12).inverse()
+    there = Similarity(step.rotation, step.translation)
+    data = of_another_world(later, there)
+
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            three, one = await members.start(3, flies_on=(1, 2, 3)), await members.stranger(1)
+            await one.meets(3)
+            if sees:
+                await three.see(demo.frame(3, 12))
+            three.track(50, demo.world_from_body(3, 12))
+            await until(lambda: bool((own := three.group.state_of(3)) and own.localized))
+            before = believed(three)
+            one.hand(BlobKind.MAP, data, 3)
+            if sees:
+                await until(lambda: three.revision == revision_of(data))
+                assert np.abs(before.local(believed(three))).max() < 1e-9
+                return
+            await computed(lambda: bool(three.exchange.refused["map that is not joined with ours"]))
+            (why,) = three.events("refused")
+            assert "it has 0 of its 3 keyframes" in why
+            assert three.revision == revision_of(ALL)
+            assert three.events("quarantine") == []
+
+    run(scenario())
+
+
+def test_keyframes_of_ours_in_a_world_that_ours_is_not_joined_with_speak_against_nobody(
+    tmp_path: Path,
+) -> None:
+    """A third part has brought them, and ours has not been handed over yet: they lie elsewhere."""
+    brought = bent(decode_map(ALL), shift_m=(9.0, 0.0, 0.0))
+
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            three, one = await members.start(3, flies_on=(1, 2, 3)), await members.stranger(1)
+            await one.meets(3)
+            three.track(50)
+            for n, name in enumerate((b"first!!!", b"second!!", b"third!!!")):
+                apart = encode_map(replace(brought, parent=name, world=b"world!!!"))
+                one.hand(BlobKind.MAP, apart, 3)
+                await computed(partial(refused, three, n + 1))
+                hurry(1.1)
+            assert three.revision == revision_of(ALL)
+            assert three.events("quarantine") == []
+
+    run(scenario())
+
+
+def refused(drone: Drone, times: int) -> bool:
+    return sum(drone.exchange.refused.values()) >= times
 
 
 def test_a_drone_that_is_ended_while_it_merges_ends_at_once(tmp_path: Path) -> None:

@@ -423,8 +423,12 @@ def test_what_needs_no_merging_is_told() -> None:
     features_of = features_in(given.views)
     itself = merged(given.senior, b"1" * 8, given.senior, b"1" * 8, features_of, OPTIONS)
     assert "not merged with itself" in reason(itself)
-    again = merged(given.senior, b"1" * 8, given.senior, b"2" * 8, features_of, OPTIONS)
-    assert "no keyframe that this one has not" in reason(again)
+    large = replace(given.junior.keyframes[0].camera, width_px=8000, height_px=4000)
+    wide = replace(
+        given.junior, keyframes=tuple(replace(k, camera=large) for k in given.junior.keyframes)
+    )
+    pixels = merged(given.senior, b"1" * 8, wide, b"2" * 8, features_of, OPTIONS)
+    assert "96000000 pixels, at most 80000000" in reason(pixels)
     many = replace(
         given.junior,
         keyframes=given.junior.keyframes * 13,
@@ -437,34 +441,8 @@ def test_what_needs_no_merging_is_told() -> None:
     assert "the other map: the map's observations do not fix it" in reason(unfixed)
 
 
-def test_what_was_joined_before_is_told_in_the_worlds_that_are_now() -> None:
-    given = two(15, errors_m=(0.0, 0.0))
-    of_before = Similarity(NORTH, np.array([1.0, 2.0, 3.0]), 1.02)
-    junior = replace(
-        given.junior,
-        parent=b"someone ",
-        world=b"theirs  ",
-        joined=(
-            JoinedMap(b"before  ", b"its own ", of_before),
-            JoinedMap(b"far away", b"its own ", Similarity(NORTH, np.full(3, 3.1e4), 1.0)),
-        ),
-    )
-    old = [JoinedMap(b"older %02d" % n, b"whatever", of_before) for n in range(15)]
-    senior = replace(given.senior, parent=b"parent  ", world=b"ours    ", joined=tuple(old))
-    found = replace(given, senior=senior, junior=junior).merged()
-    assert isinstance(found, LandmarkMap), found
-    assert found.world == b"ours    "
-    assert len(found.joined) == 16
-    names = [j.revision for j in found.joined]
-    assert names[:-2] == [j.revision for j in old[1:]]
-    before, last = found.joined[-2:]
-    assert (before.revision, last.revision) == (b"before  ", b"junior  ")
-    assert last.world == b"theirs  "
-    composed = last.world_from_other @ of_before
-    np.testing.assert_allclose(composed.difference(before.world_from_other), 0.0, atol=1e-9)
-
-
-def test_where_the_worlds_are_that_ours_knows_is_not_for_the_other_map_to_say() -> None:
+def test_what_the_other_map_says_is_in_it_is_not_carried_on() -> None:
+    """Nothing shows it, of whatever world; who is named so would not be merged any more."""
     given = two(15, errors_m=(0.0, 0.0))
     wrong = Similarity(NORTH, np.array([50.0, 0.0, 0.0]), 2.0)
     known = Similarity(NORTH, np.array([1.0, 2.0, 3.0]), 1.02)
@@ -472,26 +450,41 @@ def test_where_the_worlds_are_that_ours_knows_is_not_for_the_other_map_to_say() 
         given.junior,
         parent=b"someone ",
         world=b"theirs  ",
-        joined=(JoinedMap(b"later   ", b"known   ", wrong), JoinedMap(b"of ours ", OURS, wrong)),
+        joined=tuple(
+            JoinedMap(b"of %b" % world[:5], world, wrong)
+            for world in (b"strange ", b"known   ", OURS, b"theirs  ")
+        ),
     )
-    senior = replace(
-        given.senior,
-        parent=b"parent  ",
-        world=OURS,
-        joined=(JoinedMap(b"earlier ", b"known   ", known),),
-    )
+    old = [JoinedMap(b"older %02d" % n, b"known   ", known) for n in range(16)]
+    senior = replace(given.senior, parent=b"parent  ", world=OURS, joined=tuple(old))
     found = replace(given, senior=senior, junior=junior).merged()
     assert isinstance(found, LandmarkMap), found
-    assert [j.revision for j in found.joined] == [
-        b"earlier ",
-        b"later   ",
-        b"of ours ",
-        b"junior  ",
-    ]
-    for world, place in ((b"known   ", known), (OURS, Similarity.identity())):
-        joined = found.joined_with(world)
-        assert joined is not None
-        np.testing.assert_allclose(joined.world_from_other.difference(place), 0.0, atol=1e-9)
+    assert found.world == OURS
+    assert [j.revision for j in found.joined] == [j.revision for j in old[1:]] + [b"junior  "]
+    assert found.joined[-1].world == b"theirs  "
+    joined = found.joined_with(b"known   ")
+    assert joined is not None
+    np.testing.assert_allclose(joined.world_from_other.difference(known), 0.0, atol=1e-9)
+
+
+def test_who_flies_on_a_map_that_a_third_one_brought_is_named_when_it_offers_that() -> None:
+    """All its keyframes are in ours already: nothing is new but where its world is."""
+    given = two(15)
+    both = given.merged()
+    assert isinstance(both, LandmarkMap), both
+    features_of = features_in([])  # none are needed: what both show at one pixel is the same
+    brought = replace(both, joined=())
+    found = merged(brought, b"brought ", given.junior, b"junior  ", features_of, OPTIONS)
+    assert isinstance(found, LandmarkMap), found
+    assert (found.parent, found.world) == (b"brought ", b"senior  ")
+    assert found.keyframes == both.keyframes
+    np.testing.assert_array_equal(found.points_world, both.points_world)
+    (joined,) = found.joined
+    assert (joined.revision, joined.world) == (b"junior  ", b"junior  ")
+    off = joined.world_from_other.difference(both.joined[0].world_from_other)
+    assert np.abs(off).max() < 0.02
+    again = merged(found, b"named   ", given.junior, b"junior  ", features_of, OPTIONS)
+    assert "in this one already" in reason(again)
 
 
 def test_the_number_of_keyframes_is_bounded_and_the_newest_stay() -> None:

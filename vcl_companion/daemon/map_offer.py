@@ -9,7 +9,7 @@ from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.shared_arrays import shared
 from vcl_companion.localization.map_index import MapIndex, index_map
-from vcl_companion.mapping.agreement import broken_descent, contradiction, moved_to
+from vcl_companion.mapping.agreement import broken_descent, contradiction, moved_to, too_little_of
 from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
 from vcl_companion.mapping.options import MOST_KEYFRAMES, MOST_PIXELS
 from vcl_companion.mapping.templates import Templates, prepare_templates
@@ -77,6 +77,8 @@ class ReadyMap:
 
     Attributes:
         contradicts: how it contradicts the map in use; empty when it does not.
+        unproven: of another world that says where ours lies in it, how little of ours it has to
+            show that by; empty where that suffices.
         part_of: see ``StoredMap``.
     """
 
@@ -86,6 +88,7 @@ class ReadyMap:
     templates: Templates | None
     contradicts: str = ""
     part_of: bytes = b""
+    unproven: str = ""
 
     def stored(self) -> StoredMap:
         """Return it as it is held while it is in use."""
@@ -160,10 +163,11 @@ def ready_map(
     templates = None
     if tracked:
         templates = shared(prepare_templates(index.landmark_map, index.uncertainty, memory.pyramid))
-    contradicts = (
-        "" if current is None else _contradiction(current, index.landmark_map, offer.revision)
-    )
-    return ReadyMap(data, index, update, templates, contradicts, offer.part_of)
+    contradicts = unproven = ""
+    if current is not None:
+        contradicts = _contradiction(current, index.landmark_map, offer.revision)
+        unproven = _unproven(current, index.landmark_map, offer.revision)
+    return ReadyMap(data, index, update, templates, contradicts, offer.part_of, unproven)
 
 
 def _contradiction(current: StoredMap, landmark_map: LandmarkMap, revision: bytes) -> str:
@@ -180,6 +184,18 @@ def _contradiction(current: StoredMap, landmark_map: LandmarkMap, revision: byte
     is_child = landmark_map.parent == current.revision
     broken = broken_descent(own, landmark_map) if is_child else ""
     return broken or contradiction(own, current.index.uncertainty, landmark_map)
+
+
+def _unproven(current: StoredMap, landmark_map: LandmarkMap, revision: bytes) -> str:
+    """Say how little a map of another world has of ours, which it says was joined with it.
+
+    Without that a comparison finds nothing, and whoever made it could have us go on anywhere, at
+    any scale. Extended again and again, one that ours was merged into may have lost it honestly.
+    """
+    if landmark_map.world_of(revision) == current.world:
+        return ""
+    lacking = too_little_of(current.index.landmark_map, landmark_map)
+    return f"of ours, which it says was joined with it, {lacking}" if lacking else ""
 
 
 def with_fallbacks(

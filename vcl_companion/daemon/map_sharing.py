@@ -166,13 +166,19 @@ class MapSharing:
         if isinstance(way, str):
             return ready
         into = None if way is None else way.world_from_other
-        return replace(ready, contradicts=await self._trial.contradiction(ready, into))
+        tried = await self._trial.tried(ready, into)
+        unproven = "" if tried.shows else ready.unproven
+        return replace(ready, contradicts=tried.contradicts, unproven=unproven)
 
     def _may_merge(self, peer: int, offer: MapOffer) -> bool:
         return not self._trust.why_not(peer) and self._branches.is_to_merge(peer, offer)
 
     def _way_into(self, peer: int, ready: ReadyMap, revision: bytes) -> JoinedMap | str | None:
         """Say how we get onto a map; see ``way_into``. A senior team's must have ours in it.
+
+        What a map says of where our world lies is not believed where neither what it has of ours
+        nor a frame of our own shows it. That speaks against nobody: a map that was extended long
+        enough has nothing of ours any more.
 
         Who is lost on its own map, or flies on one that most others say is wrong, has no way
         to look for.
@@ -187,6 +193,8 @@ class MapSharing:
         ):
             return "ours is not in it"
         way = way_into(current, new, revision)
+        if isinstance(way, JoinedMap) and ready.unproven:
+            way = ready.unproven
         own = self._group.state_of(self._group.own_id)
         is_of_no_use = own is None or not own.localized or bool(ready.contradicts)
         return None if isinstance(way, str) and is_of_no_use else way
@@ -207,12 +215,17 @@ class MapSharing:
         """Whether a map is not taken for what it says; that speaks against who offers it.
 
         Where most others fly on it, it is ours that is wrong. The same map, offered again,
-        says nothing new of the peer.
+        says nothing new of the peer. Nor does one of another world that ours is not joined with,
+        though a third part of the swarm has brought it keyframes of ours: there they lie elsewhere.
         """
         if not ready.contradicts or self._group.most_others_hold(offer.revision):
             self._trust.note(peer, Evidence.MAP_TAKEN)
             return False
-        if (peer, offer.revision) not in self._contradicting:
+        current = self._maps.current
+        is_apart = current is not None and isinstance(
+            way_into(current, ready.index.landmark_map, offer.revision), str
+        )
+        if not is_apart and (peer, offer.revision) not in self._contradicting:
             self._contradicting.append((peer, offer.revision))
             self._trust.note(peer, Evidence.MAP_CONTRADICTED, f"map: {ready.contradicts}")
         return True

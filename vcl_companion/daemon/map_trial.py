@@ -2,10 +2,13 @@
 
 What is compared with the map in use is named by whoever made the other one (``agreement``). What
 our camera has seen is not: a frame whose place is known on the map in use must be found at the
-same place on the other. Where the other does not show it, that says nothing.
+same place on the other. Where the other does not show it, that says nothing against it, and
+nothing for what it says of ours.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,6 +31,19 @@ _LATEST_NS, _APART_NS = 2_000_000_000, 200_000_000
 _N_FRAMES = 2
 
 
+@dataclass(frozen=True)
+class Tried:
+    """What our frames say of a map.
+
+    Attributes:
+        contradicts: how they contradict it; empty if they do not.
+        shows: whether one of them was found on it, where it was taken.
+    """
+
+    contradicts: str = ""
+    shows: bool = False
+
+
 class MapTrial:
     """Holds maps against what our own frames have shown.
 
@@ -46,8 +62,8 @@ class MapTrial:
         self._estimator = estimator
         self._work = work
 
-    async def contradiction(self, ready: ReadyMap, other_from_world: Similarity | None) -> str:
-        """Say how our frames contradict a map; empty if they do not, or say nothing.
+    async def tried(self, ready: ReadyMap, other_from_world: Similarity | None) -> Tried:
+        """Look for our frames on a map.
 
         Args:
             ready: the map.
@@ -55,17 +71,17 @@ class MapTrial:
         """
         current, reason = self._maps.current, ""
         if current is None:
-            return ""
+            return Tried()
         for frame, state in self._known():
             there = state if other_from_world is None else carried(state, other_from_world)
             moved = await self._moved(frame, there, ready.stored(), current, may_track=True)
             if not moved:
-                return ""
+                return Tried(shows=moved == "")
             # We may be the one who is wrong: then ours, looked through, does not confirm it either.
             if await self._moved(frame, state, current, current, may_track=False) != "":
-                return ""
+                return Tried()
             reason = moved
-        return reason
+        return Tried(reason)
 
     async def _moved(
         self,

@@ -69,13 +69,19 @@ def contradiction(old: LandmarkMap, sure: MapUncertainty, new: LandmarkMap) -> s
 
 def broken_descent(old: LandmarkMap, new: LandmarkMap) -> str:
     """Say what a map lacks that says it was made from the one in use; empty if it has enough."""
+    lacking = too_little_of(old, new)
+    return f"made from ours, {lacking}" if lacking else ""
+
+
+def too_little_of(old: LandmarkMap, new: LandmarkMap) -> str:
+    """Say how little of the one in use a map has in it; empty if that is enough to compare."""
     places = _in_common(old, new)
     if len(places) < _LEAST_KEPT * len(old.keyframes):
-        return f"made from ours, it has {len(places)} of its {len(old.keyframes)} keyframes"
+        return f"it has {len(places)} of its {len(old.keyframes)} keyframes"
     n_before = int(old.seen[:, [before for before, _ in places]].any(axis=1).sum())
     n_kept = len(_same_landmarks(old, new, places)[0])
     if n_kept < _LEAST_KEPT * n_before:
-        return f"made from ours, it has {n_kept} of the {n_before} landmarks in its keyframes"
+        return f"it has {n_kept} of the {n_before} landmarks in its keyframes"
     return ""
 
 

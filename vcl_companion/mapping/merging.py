@@ -26,7 +26,7 @@ from vcl_companion.mapping.extension import ImageFeatures
 from vcl_companion.mapping.growth import Growth
 from vcl_companion.mapping.known_features import Index, KeyframeLibrary, of_keyframes
 from vcl_companion.mapping.landmark_map import MAX_JOINED, JoinedMap, Keyframe, LandmarkMap
-from vcl_companion.mapping.options import MapOptions, NoMap
+from vcl_companion.mapping.options import MOST_PIXELS, MapOptions, NoMap
 from vcl_companion.mapping.patch_table import PyramidOf, decoded_pyramid
 from vcl_companion.mapping.reconstruction import accepted
 from vcl_companion.mapping.registration import MIN_SEEN
@@ -90,6 +90,8 @@ def merged(
         stands = _aligned(one, other, features_of, options, seed, one_world=one_world)
         if isinstance(stands, NoMap):
             return stands
+        if _is_in(senior, junior):
+            return _named(senior, senior_revision, junior, junior_revision, stands)
         both = united(one, other, stands, pyramid_of, options, one_world=one_world)
         grown, number = _adjusted(both, one, other, options)
         row = np.where(both.row >= 0, number[both.row], -1)
@@ -98,7 +100,7 @@ def merged(
             grown.landmark_map,
             parent=senior_revision,
             world=senior.world_of(senior_revision),
-            joined=_joined(senior, senior_revision, junior, junior_revision, there),
+            joined=_joined(senior, junior, junior_revision, there),
         )
         return _checked(replace(grown, landmark_map=named), one, options)
     except ValueError as error:
@@ -116,6 +118,8 @@ def _aligned(
 ) -> Aligned | NoMap:
     """Find how the junior map stands to the senior: in one world where it says, if that suffices.
 
+    So it does where all its keyframes are in both.
+
     All keyframes with all, by all detectors, takes five times as long, and nobody's map is
     extended meanwhile.
     """
@@ -124,7 +128,7 @@ def _aligned(
         found = of_keyframes(features_of, detectors)
         return KeyframeLibrary(one.map, found), KeyframeLibrary(other.map, found)
 
-    if one_world:
+    if one_world or _is_in(one.map, other.map):
         few = common_where_expected(one.map, other.map, *libraries(options.detectors[:1]))
         stands = aligned(one, other, few, options, seed, one_world=True)
         if isinstance(stands, Aligned) and _is_as_expected(stands, one, other):
@@ -167,9 +171,38 @@ def _needless(
     most = _MOST_KEYFRAMES * options.max_keyframes
     if len(junior.keyframes) > most:
         return f"the other map has {len(junior.keyframes)} keyframes, at most {most}"
-    if len(shared_keyframes(senior, junior)) == len(junior.keyframes):
-        return "the other map has no keyframe that this one has not"
+    if junior.n_pixels > MOST_PIXELS:
+        return f"the other map has {junior.n_pixels} pixels, at most {MOST_PIXELS}"
+    if any(j.revision == junior_revision for j in senior.joined):
+        return "the other map is in this one already"
     return ""
+
+
+def _is_in(senior: LandmarkMap, junior: LandmarkMap) -> bool:
+    """Whether a map has no keyframe that the senior has not: merged into what that has merged."""
+    return len(shared_keyframes(senior, junior)) == len(junior.keyframes)
+
+
+def _named(
+    senior: LandmarkMap,
+    senior_revision: bytes,
+    junior: LandmarkMap,
+    junior_revision: bytes,
+    stands: Aligned,
+) -> LandmarkMap:
+    """Return the senior map as it is, but that it says where a map lies whose keyframes it has.
+
+    Who flies on that has no other way into this one.
+
+    Raises:
+        ValueError: the junior's world is too far away.
+    """
+    return replace(
+        senior,
+        parent=senior_revision,
+        world=senior.world_of(senior_revision),
+        joined=_joined(senior, junior, junior_revision, stands.senior_from_junior),
+    )
 
 
 def _side(junior: LandmarkMap, options: MapOptions) -> Side:
@@ -300,15 +333,12 @@ def _carried(whole: LandmarkMap, row: Index, junior: Side, stands: Aligned) -> S
 
 
 def _joined(
-    senior: LandmarkMap,
-    senior_revision: bytes,
-    junior: LandmarkMap,
-    junior_revision: bytes,
-    there: Similarity,
+    senior: LandmarkMap, junior: LandmarkMap, junior_revision: bytes, there: Similarity
 ) -> tuple[JoinedMap, ...]:
     """Return what the merged map says of the maps that are in it, the newest last.
 
-    Where the worlds are that the senior knows is not for the junior to say.
+    What the junior says is joined in it is not carried on: nothing here shows it, and a drone
+    whose map is said to be in ours is waited for no more. It offers its map itself, and is named.
 
     Raises:
         ValueError: the junior's world is too far away.
@@ -316,15 +346,7 @@ def _joined(
     own = JoinedMap(junior_revision, junior.world_of(junior_revision), there)
     if not _is_near(own):
         raise ValueError("the other map's world is too far away")
-    known = {j.world: j.world_from_other for j in senior.joined}  # of each world the newest
-    known[senior.world_of(senior_revision)] = Similarity.identity()
-    brought = [
-        replace(j, world_from_other=known.get(j.world) or there @ j.world_from_other)
-        for j in junior.joined
-    ]
-    brought = [j for j in brought if _is_near(j)] + [own]
-    names = {j.revision for j in brought}
-    return tuple([j for j in senior.joined if j.revision not in names] + brought)[-MAX_JOINED:]
+    return (*senior.joined, own)[-MAX_JOINED:]
 
 
 def _is_near(joined: JoinedMap) -> bool:
