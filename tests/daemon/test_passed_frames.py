@@ -11,7 +11,7 @@ import pytest
 
 from tests.daemon import demo
 from tests.daemon.swarm import INTER, swarm
-from tests.daemon.waiting import computed, passes_until, run
+from tests.daemon.waiting import computed, hurry, passes_until, run
 from tests.wire.samples import small_frame
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
@@ -38,13 +38,12 @@ class Member:
             group.heartbeat(peer, 0.0)
         self.handed: list[tuple[int, bytes]] = []
         self.cancelled: list[int] = []
+        self.work = MapWork(
+            demo.workshop(SwarmOptions((1, 2, 3)), demo.sensor(own_id), INTER), forks=False
+        )
         self.frames = PassedFrames(
-            group, self._hand, self.cancelled.append,
-            MapWork(
-                demo.workshop(SwarmOptions((1, 2, 3)), demo.sensor(own_id), INTER), forks=False
-            ),
-            lambda: all_hear,
-        )  # fmt: skip
+            group, self._hand, self.cancelled.append, self.work, lambda: all_hear
+        )
 
     def _hand(self, peer: int, blob: bytes) -> int:
         self.handed.append((peer, blob))
@@ -129,6 +128,50 @@ def test_what_nobody_needs_any_more_is_stopped() -> None:
     assert one.frames.on_their_way_to(3) == frozenset()
 
 
+def test_what_one_drone_gives_pushes_out_no_more_than_its_own() -> None:
+    three = Member(3)
+    for n in range(12):
+        three.frames.hold(frame_of(1, b"honest %d" % n))
+    for n in range(100):
+        three.frames.hold(frame_of(2, b"%d" % n))
+        three.frames.hold(frame_of(2, b"honest 3"))  # not its own: it says it again
+    held = three.frames.held
+    assert [b"honest %d" % n in held.values() for n in range(12)] == [True] * 12
+    assert sum(not image.startswith(b"honest") for image in held.values()) == 24
+    assert held[name_of_image(b"99")] == b"99"
+
+
+def test_what_one_drone_gives_is_not_looked_at_for_longer_than_a_map_can_wait() -> None:
+    """Frames of 640 x 480, and larger ones: what counts is what they take."""
+    looked_at: list[tuple[int, int]] = []
+
+    async def scenario() -> None:
+        three = Member(3)
+
+        async def look_at(frame: FrameAnswer) -> None:
+            looked_at.append((frame.drone_id, frame.camera.width_px))
+
+        three.work.look_at = look_at  # type: ignore[method-assign]
+        looking = asyncio.create_task(three.frames.run())
+        usual, large = (replace(small_frame().camera, width_px=w, height_px=h) for w, h in SIZES)
+        for n in range(10):
+            for drone_id, camera in ((1, usual), (2, large)):
+                three.frames.hold(replace(frame_of(drone_id, b"%d" % n), camera=camera))
+            await asyncio.sleep(0.0)
+        assert looked_at.count((1, 640)) == 10
+        assert looked_at.count((2, 2048)) == 2
+        hurry(8.1)
+        three.frames.hold(replace(frame_of(2, b"next"), camera=large))
+        await asyncio.sleep(0.01)
+        assert looked_at.count((2, 2048)) == 3
+        looking.cancel()
+
+    run(scenario())
+
+
+SIZES = ((640, 480), (2048, 2048))
+
+
 def test_only_the_coordinator_s_frames_are_held_and_only_so_many() -> None:
     three = Member(3)
     blob = encode_frame(frame_of(2, b"of two"), BlobKind.PASSED_FRAME)
@@ -140,7 +183,8 @@ def test_only_the_coordinator_s_frames_are_held_and_only_so_many() -> None:
     assert three.frames.held[name_of_image(b"of two")] == b"of two"
     three.frames.hold(frame_of(3, b"my own"))
     for n in range(100):
-        three.frames.take(1, encode_frame(frame_of(2, b"%d" % n), BlobKind.PASSED_FRAME))
+        frame = frame_of(1 + n % 3, b"%d" % n)  # rounds of three
+        three.frames.take(1, encode_frame(frame, BlobKind.PASSED_FRAME))
     assert len(three.frames.held) == 48
     assert name_of_image(b"my own") not in three.frames.held
     assert three.frames.held[name_of_image(b"99")] == b"99"

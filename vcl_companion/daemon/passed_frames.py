@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
+from vcl_companion.daemon.held_images import HeldImages
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.errors import WireError
 from vcl_companion.swarm.group import Group
@@ -23,8 +24,14 @@ from vcl_companion.wire.map_update import name_of_image
 
 _log = logging.getLogger(__name__)
 
-# Forty kilobytes each; and what a sender takes a peer to hold, which has its own among them.
-_N_HELD, _N_KNOWN_HELD = 48, 40
+# Frames whose features are still to be found, also of one drone; blobs whose images are known by
+# name.
+_N_NEW, _N_NEW_OF_ONE, _N_NAMES = 48, 24, 48
+# What a sender takes a peer to hold, which has its own among them: fewer than are held.
+_N_KNOWN_HELD = 40
+# So many pixels of a drone's frames are looked at in so long: 27 of 640 x 480, 2 of the largest,
+# three seconds' work. Rounds have some of them a second; whoever sends more keeps no map waiting.
+_LOOKED_AT_PX, _LOOKED_AT_S = 1 << 23, 8.0
 # What was said of blobs that are not here, or not yet.
 _N_SAID = 256
 
@@ -62,27 +69,22 @@ class PassedFrames:
         self._all_hear = all_hear
         self._work = work
         self._peers: dict[int, _AtPeer] = {}
-        self._held: dict[bytes, bytes] = {}
+        self._held = HeldImages()
         self._names: dict[bytes, bytes] = {}  # of the images of answers, by their blobs' digests
         self._said: deque[tuple[int, bytes]] = deque(maxlen=_N_SAID)
-        self._new: asyncio.Queue[FrameAnswer] = asyncio.Queue(_N_HELD)
+        self._new: asyncio.Queue[FrameAnswer] = asyncio.Queue(_N_NEW)
+        self._n_new: Counter[int] = Counter()  # of these, of each drone
+        self._looked_at: dict[int, deque[tuple[float, int]]] = {}  # when, px; of each drone
 
     @property
     def held(self) -> Mapping[bytes, bytes]:
         """Images that are here, by their names."""
-        return self._held
+        return self._held.by_name
 
     def hold(self, frame: FrameAnswer) -> None:
         """Hold the image of a frame that was given to a peer: by us, or by a member we heard."""
-        self._keep(frame.image_bytes)
+        self._held.keep(frame.drone_id, frame.image_bytes)
         self._look_at(frame)
-
-    def _keep(self, image_bytes: bytes) -> None:
-        name = name_of_image(image_bytes)
-        self._held.pop(name, None)
-        self._held[name] = image_bytes  # the last one is the last to go
-        while len(self._held) > _N_HELD:
-            del self._held[next(iter(self._held))]
 
     def take(self, peer: int, blob: bytes) -> None:
         """Hold the image of a frame that the coordinator has passed on.
@@ -98,7 +100,7 @@ class PassedFrames:
         """Note what a member has given to us, and perhaps to others, in a blob."""
         self._names[digest] = name = name_of_image(frame.image_bytes)
         self._peers.setdefault(frame.drone_id, _AtPeer()).held.append(name)
-        while len(self._names) > _N_HELD:
+        while len(self._names) > _N_NAMES:
             del self._names[next(iter(self._names))]
         said, self._said = self._said, deque(maxlen=_N_SAID)
         for peer, other in said:
@@ -116,6 +118,9 @@ class PassedFrames:
         """Find the features of what goes round, before the map needs them, until cancelled."""
         while True:
             frame = await self._new.get()
+            self._n_new[frame.drone_id] -= 1
+            if not self._may_look_at(frame):
+                continue
             try:
                 await self._work.look_at(frame)
             except ValueError as error:
@@ -180,8 +185,21 @@ class PassedFrames:
         self._peers.clear()
 
     def _look_at(self, frame: FrameAnswer) -> None:
-        if not self._new.full():
+        if self._n_new[frame.drone_id] < _N_NEW_OF_ONE and not self._new.full():
+            self._n_new[frame.drone_id] += 1
             self._new.put_nowait(frame)
+
+    def _may_look_at(self, frame: FrameAnswer) -> bool:
+        """Whether a drone's frames have not had their share of the work yet; note this one."""
+        now_s = asyncio.get_running_loop().time()
+        n_px = frame.camera.width_px * frame.camera.height_px
+        lately = self._looked_at.setdefault(frame.drone_id, deque())
+        while lately and lately[0][0] <= now_s - _LOOKED_AT_S:
+            lately.popleft()
+        if sum(px for _, px in lately) + n_px > _LOOKED_AT_PX:
+            return False
+        lately.append((now_s, n_px))
+        return True
 
     def _stop(self, there: _AtPeer | None) -> None:
         for transfer_id in there.on_their_way if there is not None else ():
