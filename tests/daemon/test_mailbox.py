@@ -6,7 +6,7 @@ import asyncio
 
 import numpy as np
 
-from tests.daemon.waiting import run
+from tests.daemon.waiting import hurry, run
 from vcl_companion.cameras.source import Frame
 from vcl_companion.daemon.mailbox import Mailbox, PeerMailbox
 
@@ -103,5 +103,26 @@ def test_of_each_peer_the_newest_waits_and_peers_take_turns() -> None:
         mailbox.put(7, "more")
         assert await mailbox.take() == (3, "modest")
         assert await mailbox.take() == (7, "more")
+
+    run(scenario())
+
+
+def test_what_is_left_for_later_gives_way_to_what_is_newer() -> None:
+    async def scenario() -> None:
+        mailbox: PeerMailbox[str] = PeerMailbox()
+        mailbox.put_later(7, "old", 5.0)
+        mailbox.put_later(3, "slow", 5.0)
+        mailbox.put(7, "new")
+        assert await mailbox.take() == (7, "new")
+        mailbox.put(7, "newer")
+        mailbox.put_later(7, "older", 0.0)
+        hurry(5.1)
+        assert await mailbox.take() == (7, "newer")
+        assert await mailbox.take() == (3, "slow")
+        hurry(10.0)
+        waiting = asyncio.create_task(mailbox.take())
+        await asyncio.sleep(0.01)
+        assert not waiting.done()
+        waiting.cancel()
 
     run(scenario())

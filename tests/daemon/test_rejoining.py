@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 from tests.daemon import demo
 from tests.daemon.bent import bent
 from tests.daemon.swarm import Drone, swarm
-from tests.daemon.waiting import computed, hurry, run, until
+from tests.daemon.waiting import computed, hurry, passes, passes_until, run, until
 from vcl_companion.daemon.feature_memory import FeatureMemory
 from vcl_companion.daemon.local_frame import origin_in_leaders_world
 from vcl_companion.daemon.map_branches import way_into
@@ -239,6 +240,52 @@ def test_keyframes_of_ours_in_a_world_that_ours_is_not_joined_with_speak_against
 
 def refused(drone: Drone, times: int) -> bool:
     return sum(drone.exchange.refused.values()) >= times
+
+
+def in_vain(n: int) -> bytes:
+    """Maps that cannot be merged: they have no scale."""
+    return encode_map(replace(decode_map(ALL), distances=(), pixel_noise_px=1.0 + n))
+
+
+def of_nothing_new(n: int) -> bytes:
+    """Maps that are worth naming, each of a world of its own."""
+    return encode_map(replace(decode_map(PAIR), pixel_noise_px=1.0 + n))
+
+
+@pytest.mark.parametrize("offered", [in_vain, of_nothing_new])
+def test_a_peer_whose_maps_bring_nothing_is_merged_with_ever_more_rarely(
+    tmp_path: Path, offered: Callable[[int], bytes]
+) -> None:
+    """Ours is not extended meanwhile. Of what has come by then only the last is merged."""
+
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            one, three = await members.start(1, flies_on=(1, 2, 3)), await members.stranger(3)
+            await three.meets(1)
+
+            def n_merges() -> int:
+                return len(one.events("merge"))
+
+            def n_ended() -> int:
+                return len(one.events("merged")) + len(one.events("not merged"))
+
+            three.hand(BlobKind.MAP, offered(0), 1)
+            await computed(lambda: n_ended() == 1)
+            await passes(0.75)
+            for n in (1, 2, 3):
+                three.hand(BlobKind.MAP, offered(n), 1)
+                await passes(0.25)
+            assert n_merges() == 1
+            await passes_until(lambda: n_merges() == 2)
+            await computed(lambda: n_ended() == 2)
+            await passes(0.75)
+            three.hand(BlobKind.MAP, offered(4), 1)
+            await passes(2.5)
+            assert n_merges() == 2
+            await passes_until(lambda: n_merges() == 3)
+            assert three.system_id in one.group.trusted
+
+    run(scenario())
 
 
 def test_a_drone_that_is_ended_while_it_merges_ends_at_once(tmp_path: Path) -> None:

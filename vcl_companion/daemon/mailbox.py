@@ -81,12 +81,21 @@ class PeerMailbox(Generic[_Item]):
 
     def __init__(self) -> None:
         self._items: dict[int, _Item] = {}
+        self._later: dict[int, asyncio.TimerHandle] = {}
         self._filled = asyncio.Event()
 
     def put(self, peer: int, item: _Item) -> None:
         """Leave something of a peer, in the place of what it had left before."""
+        if peer in self._later:
+            self._later.pop(peer).cancel()
         self._items[peer] = item
         self._filled.set()
+
+    def put_later(self, peer: int, item: _Item, in_s: float) -> None:
+        """Leave it when so long has passed, unless the peer has left something newer by then."""
+        if peer not in self._items:
+            loop = asyncio.get_running_loop()
+            self._later[peer] = loop.call_later(in_s, self.put, peer, item)
 
     async def take(self) -> tuple[int, _Item]:
         """Wait for something, and take out what came from the peer that waits longest."""

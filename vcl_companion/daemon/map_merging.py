@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -24,6 +25,11 @@ _BETWEEN_MERGES_S = 0.5
 _ROUND_S, _LOOK_S = 5.0, 0.05
 # Ours changes while it is merged with another one, but hardly so often.
 _MERGE_ATTEMPTS = 3
+# After a map that brought nothing its peer's next one waits, longer each time: ours is not extended
+# meanwhile. Honest drones run into it as well, who see another place: it speaks against nobody.
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 2.0, 32.0
+# And of the time no more than a quarter goes by with such maps of one peer.
+_WAIT_FOR_WORK = 3.0
 
 
 class MapMerging:
@@ -57,18 +63,46 @@ class MapMerging:
         self._own_maps = own_maps
         self._is_updating = is_updating
         self.is_under_way = False
+        self._in_vain: dict[int, int] = {}  # how often in a row, of each peer
+        self._next_at_s: dict[int, float] = {}
+
+    def wait_s(self, peer: int) -> float:
+        """Return for how long no map of a peer is merged; not above 0 if one may be now."""
+        return self._next_at_s.get(peer, -math.inf) - asyncio.get_running_loop().time()
 
     async def merge(self, peer: int, offer: MapOffer) -> bool:
         """Make our next revision of ours and a peer's that went apart; whether that was done."""
         self.is_under_way = True
+        loop = asyncio.get_running_loop()
         try:
             await self._round_is_over()
+            began_s, before = loop.time(), self._images()
             is_merged = await self._merge_into_current(peer, offer)
+            has_new = is_merged and not self._images() <= before
+            self._note(peer, loop.time() - began_s, brought=has_new)
         finally:
             self.is_under_way = False
         # Whoever offers one after the other does not keep ours from being extended.
         await asyncio.sleep(_BETWEEN_MERGES_S)
         return is_merged
+
+    def _note(self, peer: int, took_s: float, *, brought: bool) -> None:
+        """Have a peer's next map wait, by what came of this one and what it took."""
+        wait_s = took_s
+        if brought:
+            self._in_vain.pop(peer, None)
+        else:
+            n_before = self._in_vain.get(peer, 0)
+            self._in_vain[peer] = n_before + 1
+            longer_s = _FIRST_WAIT_S * 2.0 ** min(n_before, 30)
+            wait_s = max(min(longer_s, _LONGEST_WAIT_S), _WAIT_FOR_WORK * took_s)
+        self._next_at_s[peer] = asyncio.get_running_loop().time() + wait_s
+
+    def _images(self) -> frozenset[bytes]:
+        """Return the images of the map in use."""
+        current = self._maps.current
+        keyframes = () if current is None else current.index.landmark_map.keyframes
+        return frozenset(keyframe.image_bytes for keyframe in keyframes)
 
     async def _round_is_over(self) -> None:
         """Wait for the round that is under way: merged with what it replaces, all would be in vain.

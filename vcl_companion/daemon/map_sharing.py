@@ -129,8 +129,13 @@ class MapSharing:
         if current is not None and current.revision == offer.revision:
             self._tell_state()  # it did not know that we have it
             return
-        if self._may_merge(peer, offer) and await self.merging.merge(peer, offer):
-            return
+        if self._may_merge(peer, offer):
+            wait_s = self.merging.wait_s(peer)
+            if wait_s > 0:
+                self._offered.put_later(peer, offer, wait_s)
+                return
+            if await self.merging.merge(peer, offer):
+                return
         refusal = await self._taken(peer, offer)
         if refusal is not None:
             self._reject(peer, offer, *refusal)
