@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.daemon import demo
 from tests.daemon.swarm import DATA, MESSAGE, Drone, said, swarm, tunnel
-from tests.daemon.waiting import hurry, run, until
+from tests.daemon.waiting import hurry, passes, run, until
 from tests.wire.samples import small_map
 from vcl_companion.cameras.source import Frame
 from vcl_companion.swarm.transfer import BlobKind, TransferOptions
@@ -241,6 +241,7 @@ def test_a_request_repeated_gets_the_very_same_bytes(tmp_path: Path) -> None:
             assert answer.ned_from_body is not None
             await two.see(later(2, demo.frame(2)))
             one.forget()
+            await passes(10.5)  # it has heard that the frame has arrived
             one.say(FrameRequest(6, 0, 0.0), 2)
             assert (await one.answer())[0] == blob
             one.say(FrameRequest(7, 0, 0.0), 2)
@@ -314,6 +315,35 @@ def test_who_does_not_coordinate_is_given_a_frame_now_and_then(tmp_path: Path) -
             three.forget()
             three.say(FrameRequest(9, 0, 0.0), 2)
             assert (await three.answer())[1].request_id == 9
+
+    run(scenario())
+
+
+def test_a_frame_that_was_delivered_is_given_again_no_sooner_than_another(tmp_path: Path) -> None:
+    """Who says to have been restarted, or that it came damaged, keeps no map waiting by it."""
+
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            two = await members.start(2)
+            one, three = await members.stranger(1), await members.stranger(3)
+            await one.meets(2)
+            await three.meets(2)
+            await two.see(demo.frame(2))
+            for n, stranger in enumerate((one, three)):  # who coordinates, and who does not
+                asks = encode_payload(FrameRequest(7, 0, 0.0))
+                stranger.say_bytes(*asks, 2)
+                await stranger.answer()
+                await passes(0.5)
+                for _ in range(3):
+                    stranger.forget()
+                    stranger.say_bytes(*asks, 2)
+                    await passes(0.5)
+                assert stranger.blobs.empty()
+                kind = "frames asked for too often for no coordinator"
+                assert two.exchange.refused.get(kind, 0) == 3 * n
+                await passes(10.0)
+                stranger.say_bytes(*asks, 2)
+                assert (await stranger.answer())[1].request_id == 7
 
     run(scenario())
 

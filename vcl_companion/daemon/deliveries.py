@@ -10,6 +10,7 @@ import asyncio
 import logging
 
 from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.frame_answers import FrameAnswers
 from vcl_companion.daemon.inter_host import InterHost
 from vcl_companion.daemon.map_rounds import MapRounds
 from vcl_companion.daemon.map_sharing import MapSharing
@@ -38,6 +39,7 @@ class Deliveries:
     Args:
         group: whether frames are ours to make a map of.
         rounds: takes frames that it asked for.
+        answers: told which of its answers have arrived.
         passed: keeps frames for a map that is still to come.
         sharing: takes maps.
         host: takes requests for poses.
@@ -50,6 +52,7 @@ class Deliveries:
         self,
         group: Group,
         rounds: MapRounds,
+        answers: FrameAnswers,
         passed: PassedFrames,
         sharing: MapSharing,
         host: InterHost,
@@ -59,6 +62,7 @@ class Deliveries:
     ) -> None:
         self._group = group
         self._rounds = rounds
+        self._answers = answers
         self._passed = passed
         self._sharing = sharing
         self._host = host
@@ -85,10 +89,12 @@ class Deliveries:
                 case BlobHeld(peer=peer, digest=digest):
                     self._passed.is_held(peer, digest)
                 case BlobDelivered(peer=peer, transfer_id=transfer_id):
+                    self._answers.ended(peer, transfer_id, delivered=True)
                     self._passed.ended(peer, transfer_id, delivered=True)
                     now_s = asyncio.get_running_loop().time()
                     self._sharing.handing.delivered(peer, transfer_id, now_s)
                 case TransferFailed(peer=peer, transfer_id=transfer_id, reason=reason):
+                    self._answers.ended(peer, transfer_id, delivered=False)
                     self._passed.ended(peer, transfer_id, delivered=False)
                     self._log.event("transfer", f"to drone {peer}: {reason}")
                     _log.warning("transfer to drone %d failed: %s", peer, reason)

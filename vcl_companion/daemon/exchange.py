@@ -249,6 +249,7 @@ class Exchange:
         self._deliveries = Deliveries(
             group,
             self._rounds,
+            self._answers,
             self._passed,
             self._sharing,
             self._inter_host,

@@ -60,10 +60,20 @@ class _Given:
         return self.wanted.request_id == wanted.request_id and (was_known or not is_known)
 
 
+@dataclass(frozen=True)
+class _Over:
+    """What became of the transfer of a peer's last answer, and when; to the request of a number."""
+
+    request_id: int
+    at_s: float
+    delivered: bool
+
+
 class FrameAnswers:
     """Answers peers' requests for our frames, one after the other; silent when there is none.
 
-    The last answer to a peer is kept for when it asks again.
+    The last answer to a peer is kept for when it asks again, as often as it likes, while that is on
+    its way. One that was delivered is over, and not given again so soon.
 
     Args:
         system_id: this drone.
@@ -116,6 +126,8 @@ class FrameAnswers:
         self._wanted: PeerMailbox[_Wanted] = PeerMailbox()
         self._given: dict[int, _Given] = {}
         self._on_its_way: dict[int, tuple[int, ...]] = {}
+        self._sent: dict[int, tuple[int, int]] = {}  # request and transfer, to who has asked
+        self._over: dict[int, _Over] = {}
         self._of_others: dict[int, tuple[int, float]] = {}  # members' that do not coordinate
 
     def want(self, peer: int, request: FrameRequest, *, leads: bool) -> bool:
@@ -141,7 +153,8 @@ class FrameAnswers:
         """Whether who does not coordinate may ask for this frame now."""
         now_s = asyncio.get_running_loop().time()
         last_id, taken_at_s = self._of_others.get(peer, (None, -math.inf))
-        if request_id == last_id:
+        over = self._over.get(peer)
+        if request_id == last_id and (over is None or over.request_id != request_id):
             return True
         if now_s < taken_at_s + _OTHERS_EVERY_S:
             return False
@@ -168,9 +181,25 @@ class FrameAnswers:
             for before in set(self._on_its_way.get(peer, ())).difference(sent):
                 self._cancel(before)  # it wants another one by now
             self._on_its_way[peer] = sent
+            self._sent[peer] = wanted.request_id, sent[0]
+            self._over.pop(peer, None)
+
+    def ended(self, peer: int, transfer_id: int, *, delivered: bool) -> None:
+        """Note that a transfer to a peer is over, one of ours or any other."""
+        request_id, own_id = self._sent.get(peer, (0, None))
+        if own_id == transfer_id:
+            now_s = asyncio.get_running_loop().time()
+            self._over[peer] = _Over(request_id, now_s, delivered)
+
+    def _has_it(self, peer: int, request_id: int) -> bool:
+        """Whether a peer has just been delivered the answer to a request."""
+        over, now_s = self._over.get(peer), asyncio.get_running_loop().time()
+        if over is None or not over.delivered or now_s >= over.at_s + _OTHERS_EVERY_S:
+            return False
+        return over.request_id == request_id
 
     async def _blob_for(self, peer: int, wanted: _Wanted) -> bytes | None:
-        """Return the encoded answer to a request, or None when there is no frame of that instant.
+        """Return the encoded answer to a request, or None when there is none to be given.
 
         Asked again, the very same bytes: an answer on its way is not begun anew.
 
@@ -179,7 +208,7 @@ class FrameAnswers:
         """
         given = self._given.get(peer)
         if given is not None and given.answers(wanted):
-            return given.blob
+            return None if self._has_it(peer, wanted.request_id) else given.blob
         frame = await self._choice.of(wanted.instant.at_ns)
         if frame is None:
             return None
