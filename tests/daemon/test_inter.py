@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 from dataclasses import replace
@@ -450,5 +451,45 @@ def test_hostile_requests_are_counted_or_refused_and_the_host_flies_on(
                     within_rad=0.05,
                 )
                 assert one.sources() == [(0, "localized", "intra")]
+
+    run(scenario())
+
+
+def test_a_peer_that_asks_all_the_time_is_answered_now_and_then(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            host = await members.start(1, MAP)
+            stranger = await members.stranger(2)
+            await stranger.meets(1)
+            loop, answered_at_s = asyncio.get_running_loop(), []
+            for request_id in range(4):
+                request = PoseRequest(bytes(8), demo.answer(2, 0, request_id))
+                stranger.hand(BlobKind.POSE_REQUEST, encode_pose_request(request), 1)
+                assert (await answer_to(stranger)).request_id == request_id
+                answered_at_s.append(loop.time())
+            assert np.diff(answered_at_s).min() > 0.4  # each has its own way here and back
+            assert host.exchange.refused == {}
+
+    run(scenario())
+
+
+def test_larger_images_than_cameras_here_have_are_not_looked_at(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            host = await members.start(1, MAP)
+            stranger = await members.stranger(2)
+            await stranger.meets(1)
+            usual = demo.answer(2, 0, request_id=1)
+            wide = replace(usual.camera, width_px=2048, height_px=2048)
+            for frame, why in (
+                (replace(usual, camera=wide), "a frame of 4194304 pixels, at most 2097152"),
+                (
+                    replace(usual, request_id=2, image_bytes=bytes(300_000)),
+                    "an image of 300000 bytes, at most 262144",
+                ),
+            ):
+                request = PoseRequest(host.revision, frame)
+                stranger.hand(BlobKind.POSE_REQUEST, encode_pose_request(request), 1)
+                assert await answer_to(stranger) == PoseRefused(frame.request_id, why)
 
     run(scenario())

@@ -228,7 +228,7 @@ class Exchange:
             self.frames,
             estimator,
             self._outbox.send,
-            self._refusals.count,
+            self.trust.malformed,
             self.trust.why_not,
             clock,
             self.clocks,

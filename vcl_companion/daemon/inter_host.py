@@ -24,6 +24,7 @@ from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.inter import NoProposal, Proposal
 from vcl_companion.localization.map_index import MapIndex
 from vcl_companion.vision.features import Detector
+from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.pose_messages import (
     PoseProposal,
     PoseRefused,
@@ -35,19 +36,24 @@ _log = logging.getLogger(__name__)
 
 # Our own frame of that moment may be being looked at right now.
 _SETTLE_S = 0.5
+# Looking costs a fifth of a second of one core: of a peer's requests one in so long is looked at,
+# and no more than half of the time goes by with them. Who asks sooner is answered later.
+_EVERY_S = 0.5
+# Of a request's image. A swarm whose map has larger frames has cameras for it.
+_MOST_BYTES, _MOST_PX = 1 << 18, 1 << 21
 # The map may have to be indexed by our detector first, behind an update that is being built.
 _INDEX_WAIT_S = 3.0
 
 
 class InterHost:
-    """Answers the targets' requests, one after the other, the newest of each only.
+    """Answers the targets' requests, one after the other, the newest of each only, now and then.
 
     Args:
         maps: the current map.
         frames: our own.
         estimator: what we believed when these were taken.
         answer: sends a message to a peer.
-        refuse: counts what a peer sent in vain: peer, kind, detail.
+        malformed: told of bytes that no drone sends: peer, kind, what is wrong with them.
         why_not: says why nothing is done for a peer; empty if it is.
         clock: time base of frames.
         clocks: whose instants are when.
@@ -64,7 +70,7 @@ class InterHost:
         frames: FrameHistory,
         estimator: Estimator,
         answer: Callable[[PoseProposal | PoseRefused, int], None],
-        refuse: Callable[[int, str, str], None],
+        malformed: Callable[[int, str, WireError], None],
         why_not: Callable[[int], str],
         clock: Clock,
         clocks: PeerClocks,
@@ -78,7 +84,7 @@ class InterHost:
         self._frames = frames
         self._estimator = estimator
         self._answer = answer
-        self._refuse = refuse
+        self._malformed = malformed
         self._why_not = why_not
         self._clock = clock
         self._clocks = clocks
@@ -87,6 +93,7 @@ class InterHost:
         self._is_made = detector in indexed_by
         self._tries_all = tries_all
         self._requests: PeerMailbox[tuple[int, bytes]] = PeerMailbox()
+        self._next_at_s: dict[int, float] = {}  # of each peer
 
     def offer(self, peer: int, blob: bytes) -> None:
         """Take a peer's request; looked at when its turn comes, unless a newer one is there."""
@@ -94,16 +101,24 @@ class InterHost:
 
     async def run(self) -> None:
         """Answer requests until cancelled."""
+        loop = asyncio.get_running_loop()
         while True:
             peer, (came_at_ns, blob) = await self._requests.take()
+            began_s = loop.time()
+            wait_s = self._next_at_s.get(peer, began_s) - began_s
+            if wait_s > 0.0:
+                self._requests.put_later(peer, (came_at_ns, blob), wait_s)
+                continue
             try:
                 request = decode_pose_request(blob)
                 if request.frame.drone_id != peer:
                     raise WireError(f"the frame of drone {request.frame.drone_id}")
             except WireError as error:
-                self._refuse(peer, "pose request", str(error))
+                self._malformed(peer, "pose request", error)
                 continue
             self._answer(await self._answer_to(request, came_at_ns), peer)
+            now_s = loop.time()
+            self._next_at_s[peer] = max(began_s + _EVERY_S, 2.0 * now_s - began_s)
 
     async def _answer_to(self, request: PoseRequest, came_at_ns: int) -> PoseProposal | PoseRefused:
         request_id = request.frame.request_id
@@ -124,7 +139,7 @@ class InterHost:
         if stored is None or request.revision not in (stored.revision, stored.parent):
             return NoProposal("the host flies on another map")
         asked = request.frame
-        why_not = self._why_not(asked.drone_id)
+        why_not = self._why_not(asked.drone_id) or _too_large(asked, stored)
         if why_not:
             return NoProposal(why_not)
         instant = self._clocks.instant(
@@ -168,6 +183,18 @@ class InterHost:
             if state is not None:
                 return frame, state
         return None
+
+
+def _too_large(asked: FrameAnswer, stored: StoredMap) -> str:
+    """Say why a request's image is not looked at; empty if it is."""
+    n_px = asked.camera.width_px * asked.camera.height_px
+    cameras = [keyframe.camera for keyframe in stored.index.landmark_map.keyframes]
+    most_px = max(_MOST_PX, *(camera.width_px * camera.height_px for camera in cameras))
+    if n_px > most_px:
+        return f"a frame of {n_px} pixels, at most {most_px}"
+    if len(asked.image_bytes) > _MOST_BYTES:
+        return f"an image of {len(asked.image_bytes)} bytes, at most {_MOST_BYTES}"
+    return ""
 
 
 def _index_by(detector: Detector, stored: StoredMap) -> MapIndex | None:
