@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +18,9 @@ from tests.daemon.swarm import INTER, Drone, Stranger, swarm
 from tests.daemon.waiting import hurry, passes, passes_until, run, until
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.swarm.transfer import BlobKind
+from vcl_companion.wire.frame_codec import encode_frame
 from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
+from vcl_companion.wire.map_update import encode_map_update
 from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
 from vcl_companion.wire.pose_messages import (
     PoseProposal,
@@ -246,3 +250,79 @@ def test_a_newcomer_that_took_a_bent_map_follows_the_others(tmp_path: Path) -> N
             assert drone.events("quarantine") == []
 
     run(scenario())
+
+
+def no_map(n: int) -> bytes:
+    """Another one each time: a blob that came already is not taken again."""
+    return NEXT[: -1 - n]
+
+
+BAD_BYTES = (
+    (BlobKind.MAP, "map", lambda n: bytes([3, 0x42, n])),
+    (BlobKind.MAP, "map", no_map),
+    (BlobKind.POSE_REQUEST, "pose request", lambda n: bytes([3, 0x43, n])),
+    (BlobKind.PASSED_FRAME, "passed frame", lambda n: bytes([3, 0x45, n])),
+)
+
+
+@pytest.mark.parametrize(("kind", "name", "blob"), BAD_BYTES)
+def test_whoever_sends_what_no_drone_sends_is_quarantined(
+    tmp_path: Path, kind: BlobKind, name: str, blob: Callable[[int], bytes]
+) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            drone = await members.start(2, (1, 2))
+            stranger = await members.stranger(1)
+            await stranger.meets(2)
+            for n in range(12):
+                assert drone.events("quarantine") == []
+                stranger.hand(kind, blob(n), 2)
+                await refused_as(drone, name, n + 1)
+                await passes(1.25)
+            (event,) = drone.events("quarantine")
+            assert event.startswith(f"drone 1 for 60 s: {name}: ")
+
+    run(scenario())
+
+
+def test_what_is_lacking_for_an_update_is_no_such_evidence(tmp_path: Path) -> None:
+    """Its parent or an image is not here, or who passes frames on does not lead any more."""
+    whole = decode_map(NEXT)
+    update = encode_map_update(NEXT, decode_map(PAIR), whole)
+    frame = encode_frame(demo.answer(1), BlobKind.PASSED_FRAME)
+
+    async def scenario() -> None:
+        async with swarm(1, 2, 3, path=tmp_path) as members:
+            drone = await members.start(2, (1, 2))
+            one, three = await members.stranger(1), await members.stranger(3)
+            for stranger in (one, three):
+                await stranger.meets(2)
+            three.hand(BlobKind.PASSED_FRAME, frame, 2)
+            await refused_as(drone, "passed frame")
+            for n in range(14):
+                one.hand(BlobKind.MAP_UPDATE, update[: -1 - n], 2)
+                await refused_as(drone, "map", n + 1)
+                await passes(1.25)
+            assert drone.events("quarantine") == []
+
+    run(scenario())
+
+
+def test_a_map_that_cannot_be_taken_for_an_unforeseen_reason_ends_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def scenario() -> None:
+        async with swarm(1, 2, path=tmp_path) as members:
+            drone = await members.start(2, (1, 2))
+            stranger = await members.stranger(1)
+            await stranger.meets(2)
+            carry, drone.group.may_lead = drone.group.may_lead, None  # type: ignore[assignment]
+            stranger.hand(BlobKind.MAP, NEXT, 2)
+            await until(lambda: "taking a map failed, and goes on" in caplog.messages)
+            drone.group.may_lead = carry  # type: ignore[method-assign]
+            stranger.forget()
+            drone.exchange._sharing.offer(1, BlobKind.MAP, NEXT)
+            await until(lambda: drone.revision == revision_of(NEXT))
+
+    with caplog.at_level(logging.ERROR):
+        run(scenario())

@@ -66,6 +66,28 @@ def test_memory_stays_within_the_quota_whatever_is_begun() -> None:
     assert MIB < peak_bytes < 9 * MIB  # the quota, a copy while one grows, answers owed
 
 
+def test_what_one_peer_has_finished_does_not_make_another_s_be_forgotten() -> None:
+    """Its late chunks would begin it anew, and it would be taken twice."""
+    transfers = transfers_with(SMALL)
+
+    def give(peer: int, blob: bytes) -> list[Event]:
+        descriptor = describe(BlobKind.MAP, blob)
+        chunks = range(descriptor.n_chunks)
+        return [
+            event
+            for i in chunks
+            for event in transfers.receive(
+                peer, Chunk(descriptor.tag, i, 0, descriptor.cut(blob, i)), 0.0
+            )
+        ]
+
+    assert give(2, BLOB) == [BlobReceived(2, BlobKind.MAP, BLOB)]
+    for n in range(3000):
+        assert give(1, b"junk %d" % n)
+    assert give(2, BLOB) == []
+    assert give(1, b"junk 2999") == []
+
+
 def test_one_peer_gets_half_of_the_memory_and_others_still_get_through() -> None:
     transfers = transfers_with(SMALL)
     for tag in range(4):

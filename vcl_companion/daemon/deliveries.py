@@ -119,7 +119,11 @@ class Deliveries:
     def _take_passed(self, peer: int, blob: bytes) -> None:
         if self._trust.bars(peer, "frame"):
             return
+        if peer != self._group.coordinator:
+            # Who has led until now does not know yet.
+            self._refusals.count(peer, "passed frame", "not by the coordinator")
+            return
         try:
-            self._passed.take(peer, blob)
+            self._passed.take(blob)
         except WireError as error:
-            self._refusals.count(peer, "passed frame", str(error))
+            self._trust.malformed(peer, "passed frame", error)

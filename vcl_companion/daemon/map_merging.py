@@ -13,7 +13,7 @@ from vcl_companion.daemon.map_branches import MapBranches
 from vcl_companion.daemon.map_offer import MapOffer
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
-from vcl_companion.daemon.mishaps import made_or_no_map
+from vcl_companion.daemon.mishaps import BadBytes, made_or_no_map
 from vcl_companion.daemon.own_maps import OwnMaps
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import NoMap
@@ -42,6 +42,7 @@ class MapMerging:
         branches: told what came of it.
         own_maps: flies on what was made.
         is_updating: whether a round of ours is under way that updates the map.
+        bad_bytes: told of a peer's that are no map, and why.
 
     Attributes:
         is_under_way: whether another map is being merged into ours.
@@ -55,6 +56,7 @@ class MapMerging:
         branches: MapBranches,
         own_maps: OwnMaps,
         is_updating: Callable[[], bool],
+        bad_bytes: Callable[[int, str], None],
     ) -> None:
         self._maps = maps
         self._log = log
@@ -62,6 +64,7 @@ class MapMerging:
         self._branches = branches
         self._own_maps = own_maps
         self._is_updating = is_updating
+        self._bad_bytes = bad_bytes
         self.is_under_way = False
         self._in_vain: dict[int, int] = {}  # how often in a row, of each peer
         self._next_at_s: dict[int, float] = {}
@@ -135,6 +138,8 @@ class MapMerging:
                 self._log.event("merged", f"map {offer.revision.hex()} of drone {peer}")
                 _log.info("the map of drone %d is merged into ours", peer)
                 return True
+        if isinstance(made, BadBytes):
+            self._bad_bytes(peer, made.reason)
         reason = made.reason if isinstance(made, NoMap) else "ours changed meanwhile"
         self._branches.refused(offer.revision)
         self._log.event("not merged", f"map of drone {peer}: {reason}")

@@ -22,6 +22,7 @@ from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_trial import MapTrial
 from vcl_companion.daemon.map_use import MapUse
 from vcl_companion.daemon.map_work import MapWork
+from vcl_companion.daemon.mishaps import BadBytes, survived
 from vcl_companion.daemon.own_maps import OwnMaps
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.daemon.peer_trust import PeerTrust
@@ -100,7 +101,9 @@ class MapSharing:
         self._use = MapUse(group, maps, log, work, disk, passed, tell_state, falls_back)
         self.handing = MapHanding(group, transfers, maps, work, passed, self._branches)
         self.own_maps = OwnMaps(group, maps, work, self._branches, self.handing, self._use)
-        self.merging = MapMerging(maps, log, work, self._branches, self.own_maps, is_updating)
+        self.merging = MapMerging(
+            maps, log, work, self._branches, self.own_maps, is_updating, self._bad_bytes
+        )
 
     def offer(self, peer: int, kind: BlobKind, blob: bytes) -> None:
         """Take a peer's encoded map, whole or without its parent's images.
@@ -110,7 +113,7 @@ class MapSharing:
         try:
             self._offered.put(peer, MapOffer.of(kind, blob))
         except WireError as error:
-            self._refuse(peer, "map", str(error))
+            self._trust.malformed(peer, "map", error)
 
     async def run(self) -> None:
         """Take in what peers offer, and index what is in use, until cancelled."""
@@ -122,7 +125,9 @@ class MapSharing:
     async def _take_offers(self) -> None:
         """Look at one map after the other."""
         while True:
-            await self._take_offer(*await self._offered.take())
+            peer, offer = await self._offered.take()
+            with survived("taking a map"):
+                await self._take_offer(peer, offer)
 
     async def _take_offer(self, peer: int, offer: MapOffer) -> None:
         current = self._maps.current
@@ -147,6 +152,9 @@ class MapSharing:
             return why_not, ""
         ready = await self._use.made_ready(offer)
         if isinstance(ready, NoMap):
+            # What an update lacks, its parent or an image, honest drones do not know.
+            if isinstance(ready, BadBytes) and offer.kind != BlobKind.MAP_UPDATE:
+                self._bad_bytes(peer, ready.reason)
             return "map", ready.reason
         ready = await self._tried(ready, offer.revision)
         why_not = self._why_not(peer, offer)  # again: preparing took a while
@@ -234,6 +242,9 @@ class MapSharing:
             self._contradicting.append((peer, offer.revision))
             self._trust.note(peer, Evidence.MAP_CONTRADICTED, f"map: {ready.contradicts}")
         return True
+
+    def _bad_bytes(self, peer: int, why: str) -> None:
+        self._trust.note(peer, Evidence.MALFORMED, f"map: {why}")
 
     def _why_not(self, peer: int, offer: MapOffer) -> str | None:
         """Return why we do not fly on a peer's map, or None if we do.

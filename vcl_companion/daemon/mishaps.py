@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Awaitable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TypeVar
 
 from vcl_companion.errors import WireError
 from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.mapping.options import NoMap
+from vcl_companion.wire.header import VersionMismatchError
 
 _log = logging.getLogger(__name__)
 
@@ -17,6 +19,11 @@ _Made = TypeVar("_Made")
 # What has been said of errors that nobody has foreseen: with every frame it would fill the journal.
 _said: set[str] = set()
 _MOST_SAID = 64
+
+
+@dataclass(frozen=True)
+class BadBytes(NoMap):
+    """Nothing can be made of bytes that no drone sends, and why."""
 
 
 async def made_or_no_map(making: Awaitable[_Made], cannot: str, failed: str) -> _Made | NoMap:
@@ -32,7 +39,11 @@ async def made_or_no_map(making: Awaitable[_Made], cannot: str, failed: str) -> 
     """
     try:
         return await making
-    except (WireError, ValueError) as error:
+    except VersionMismatchError as error:
+        return NoMap(str(error))
+    except WireError as error:
+        return BadBytes(str(error))
+    except ValueError as error:
         return NoMap(str(error))
     except Exception as error:
         _log.exception(cannot)

@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 
 from vcl_companion.daemon.held_images import HeldImages
 from vcl_companion.daemon.map_work import MapWork
-from vcl_companion.errors import WireError
 from vcl_companion.swarm.group import Group
 from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame, encode_frame
 from vcl_companion.wire.header import BlobKind
@@ -86,14 +85,12 @@ class PassedFrames:
         self._held.keep(frame.drone_id, frame.image_bytes)
         self._look_at(frame)
 
-    def take(self, peer: int, blob: bytes) -> None:
+    def take(self, blob: bytes) -> None:
         """Hold the image of a frame that the coordinator has passed on.
 
         Raises:
-            WireError: it is no frame, or not from the coordinator.
+            WireError: it is no frame.
         """
-        if peer != self._group.coordinator:
-            raise WireError("a frame passed on, but not by the coordinator")
         self.hold(decode_frame(blob, BlobKind.PASSED_FRAME))
 
     def answered(self, frame: FrameAnswer, digest: bytes) -> None:

@@ -39,7 +39,8 @@ from vcl_companion.wire.tunnel import encode_payload
 
 _MAX_DAMAGED = 3  # whole blobs with a wrong hash before a transfer is refused
 _MAX_STATUSES = 8  # payloads in one answer
-_MAX_SETTLED = 1024  # remembered finished transfers, of all peers
+# Remembered finished transfers, of all peers and of one: in 120 s two a second.
+_MAX_SETTLED, _MAX_SETTLED_OF_ONE = 1024, 240
 _MAX_ANSWERS = 64  # answers owed at one time, to one peer
 _QUIET_SHARE = 0.1  # of the status interval: no chunk for this long, and an answer goes out
 _IDLE_SHARE = 0.25  # of the give-up time: silent for this long, and memory may be taken
@@ -351,9 +352,12 @@ class Receptions:
         return event
 
     def _settle(self, key: _Key, settled: _Settled) -> None:
-        """Remember how a transfer ended, and forget the oldest of too many."""
+        """Remember how a transfer ended; of too many forget the oldest, first the peer's own."""
         self._incoming.pop(key, None)
         self._settled[key] = settled
+        of_peer = [other for other in self._settled if other[0] == key[0]]
+        if len(of_peer) > _MAX_SETTLED_OF_ONE:
+            del self._settled[of_peer[0]]
         while len(self._settled) > _MAX_SETTLED:
             del self._settled[next(iter(self._settled))]
 
