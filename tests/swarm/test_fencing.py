@@ -109,6 +109,14 @@ def test_who_coordinates_is_believed_alone_and_what_it_said_before_it_was_known_
     assert not group.may_lead(1)
 
 
+def test_what_a_quarantined_leader_tells_is_not_taken() -> None:
+    group = Group(FOUR, 2)
+    group.distrust(frozenset({1}))
+    group.map_state(1, state(0x901), 0.0)
+    group.poll(0.1)
+    assert (group.coordinator, group.epoch) == (1, FIRST)
+
+
 def test_the_leader_takes_a_newer_one_whoever_has_heard_of_another() -> None:
     group = Group(FOUR, 1)
     group.map_state(2, state(), 0.0)

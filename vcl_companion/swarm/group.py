@@ -399,8 +399,11 @@ class Group:
 
     def _rightful(self, team: int, members: tuple[int, ...]) -> int | None:
         """Return who leads a team of these members, whoever else may come; None for nobody."""
-        if self.leader in members and self._is_settled(self.leader):
-            return self.leader
+        first: int | None = self.leader
+        if first not in members:
+            first = next((m for m in members if m not in self._distrusted), None)
+        if first is None or self._is_settled(first):
+            return first
         believed = [m for m in members if m not in self._distrusted]
         order = [self.leader, *believed] if self.leader in members else believed
         for member in order:
@@ -412,7 +415,7 @@ class Group:
                 return other
             if not self._comebacks.has_restarted(member):
                 return member
-        return next(iter(order), None)
+        return first
 
     def _is_settled(self, member: int) -> bool:
         return self._comebacks.is_settled(member, self._presence.now_s)
@@ -468,7 +471,8 @@ class Group:
         if self._team == 0 and lead != self.leader:
             self._epochs.hear(0, VACANT)
         # It may have taken one before we held it for the one to lead.
-        self._epochs.hear(self._team, self._epoch_told(lead, self._team))
+        if lead not in self._distrusted:
+            self._epochs.hear(self._team, self._epoch_told(lead, self._team))
         if lead != self.own_id or self._epochs.is_ours(self._team):
             return
         if self._team != 0 or self.epoch != FIRST:
