@@ -69,7 +69,7 @@ def fly_live(
     plan = plan_live(scenario, out, options)
     check_settings(plan)
     stored = None if map_of is None else _last_map(map_of)
-    prepare_folder(out, plan)
+    prepare_folder(out, plan, records=True)
     for planned in plan.drones:
         run = out / "run" / planned.name
         write_sensor(run / "sensor.yaml", planned.drone.sensor)

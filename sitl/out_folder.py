@@ -41,8 +41,13 @@ def files_in_one_line() -> Iterator[None]:
         raise FlightError(f"{which}{reason_of(error) or type(error).__name__}") from error
 
 
-def prepare_folder(out: Path, plan: FlightPlan) -> None:
+def prepare_folder(out: Path, plan: FlightPlan, *, records: bool = False) -> None:
     """Make the output folder, without what an earlier flight left in it.
+
+    Args:
+        out: the folder.
+        plan: of the flight.
+        records: whether its recording is made in flight, in that folder.
 
     Raises:
         ConfigError: it holds something else, or cannot be written.
@@ -52,7 +57,8 @@ def prepare_folder(out: Path, plan: FlightPlan) -> None:
         if earlier is not None and out.resolve() == earlier.resolve():
             raise ConfigError(f"--out and --attitude are the same folder, {out}")
         flown = plan.recording.path.resolve()
-        if any(flown.is_relative_to((out / name).resolve()) for name in _OWN_FOLDERS):
+        removed = [(out / name).resolve() for name in _OWN_FOLDERS]
+        if not records and any(flown.is_relative_to(folder) for folder in removed):
             raise ConfigError(f"{out}: holds the recording to be flown; give another folder")
         if out.exists() and not out.is_dir():
             raise ConfigError(f"{out}: is a file; give a folder")

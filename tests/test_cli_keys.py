@@ -1,6 +1,8 @@
 """`vcl keys`: from a new key to a daemon that takes it, and every way to get it wrong."""
 
+import errno
 import hashlib
+import os
 import re
 import subprocess
 import sys
@@ -34,7 +36,9 @@ def key(tmp_path: Path) -> Path:
 
 def drone_config(folder: Path, key_file: Path | str) -> Path:
     path = folder / "drone.toml"
-    path.write_text(f"[peers]\nto = ['127.0.0.1:9']\nkey_file = '{key_file}'\n")
+    path.write_text(
+        f"[swarm]\nmembers = [1, 2]\n[peers]\nto = ['127.0.0.1:9']\nkey_file = '{key_file}'\n"
+    )
     path.chmod(0o640)
     return path
 
@@ -68,6 +72,20 @@ def test_the_secret_is_shown_on_request_as_ground_stations_take_it(key: Path) ->
     secret = hashlib.sha256(passphrase[1].encode()).digest()
     expected = hashlib.sha256(b"vcl key fingerprint\0" + secret).hexdigest()[:16]
     assert fingerprint(shown) == expected
+
+
+def test_a_full_disk_leaves_no_half_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would be taken for one that is there already."""
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    path = tmp_path / "k.key"
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "fsync", full)
+        assert_one_line(vcl("new", path), "k.key: No space left on device")
+    assert list(tmp_path.iterdir()) == []
+    assert vcl("new", path)[0] == 0
 
 
 def test_a_key_goes_to_a_folder_under_its_own_name(tmp_path: Path, key: Path) -> None:
@@ -113,6 +131,12 @@ def test_mistakes_are_one_line_and_status_2(tmp_path: Path, key: Path) -> None:
     assert_one_line(vcl("install", key, "--config", config), "[peers] key_file", "vcl keys new")
     config.write_text("")
     assert_one_line(vcl("install", key, "--config", config), "[peers] key_file: is not set")
+    # What is no key is not replaced by one, whatever the configuration says.
+    config = drone_config(tmp_path, tmp_path / "text")
+    assert_one_line(vcl("install", key, "--config", config), "is there, and is no key file")
+    assert (tmp_path / "text").read_text() == "my secret"
+    config = drone_config(tmp_path, "/dev/null")
+    assert_one_line(vcl("install", key, "--config", config), "is there, and is no key file")
     key.chmod(0o644)
     assert_one_line(vcl("show", key), "others can read", "chmod 600")
     assert_one_line(vcl("show", "--secret", key), "others can read", "chmod 600")
@@ -127,7 +151,8 @@ def test_a_daemon_does_not_start_without_its_key(tmp_path: Path, mode: int | Non
     sensor = Path(__file__).parents[1] / "sitl/recordings/demo/mav0/cam0/sensor.yaml"
     config = tmp_path / "drone.toml"
     config.write_text(
-        f"[camera]\ncalibration = '{sensor}'\n[peers]\nto = ['127.0.0.1:9']\nkey_file = '{key}'\n"
+        f"[camera]\ncalibration = '{sensor}'\n[swarm]\nmembers = [1, 2]\n"
+        f"[peers]\nto = ['127.0.0.1:9']\nkey_file = '{key}'\n"
     )
     result = subprocess.run(
         [sys.executable, "-m", "vcl_companion.cli", "run", "--config", str(config)],

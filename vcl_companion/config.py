@@ -111,6 +111,15 @@ class Config:
             raise ConfigError(
                 f"system_id: {self.system_id} is not in swarm.members {list(members)}"
             )
+        others = [m for m in members if m != self.system_id]
+        if others and not self.peers.to:
+            raise ConfigError(
+                f"peers.to: is empty, and swarm.members names {others}; their ADDRESS:PORT go there"
+            )
+        if self.peers.to and not others:
+            raise ConfigError(
+                "swarm.members: names no other drone, and peers.to has addresses of some"
+            )
 
     def recognised_by(self) -> tuple[Detector, ...]:
         """Return the detectors by which maps are recognised, in the order in which they try."""

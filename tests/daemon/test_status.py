@@ -44,6 +44,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     [
         {"state": "critical"},
         {"written_at_s": 1.0},
+        {"written_at_s": time.time() + 3600.0},
         {"autopilot": replace(FUSED, fusion="rejected", reason="its estimator has no position")},
     ],
 )
@@ -56,6 +57,8 @@ def test_people_are_told_what_to_do() -> None:
     assert "our poses fused" in text
     assert "VISO_DELAY_MS should be 24 ms less" in text
     assert "986 landmarks in 3 keyframes" in text
+    text = status_lines(replace(good(), written_at_s=time.time() + 3600.0))[0]
+    assert "3600 s from now, by a clock that was set back since" in text
     late = replace(good(), autopilot=replace(FUSED, firmware="px4", ahead_ms=-40.0), map=None)
     text = "\n".join(status_lines(late))
     assert "EKF2_EV_DELAY should be 40 ms more" in text

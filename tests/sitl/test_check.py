@@ -272,6 +272,15 @@ def test_wrong_parameters_are_named_mended_and_put_back(tmp_path: Path) -> None:
         again = check(config, "--restore")
         assert again.exit_code == 2
         assert "nothing to restore" in again.output
+    for broken in ('{"VISO_TYPE": NaN}', "{}"):
+        kept.write_text(broken)
+        nothing = check(config, "--restore", "--yes")
+        assert nothing.exit_code == 2
+        assert "one.parameters.json: holds no parameters" in nothing.output
+    kept.write_text('{"VISO_TYPE": 0}')
+    alone = check(config, "--restore", "--yes")
+    assert alone.exit_code == 2
+    assert alone.output.endswith(f"over udp:127.0.0.1:{port}: nothing is changed\n")
 
 
 def test_an_autopilot_that_is_not_there_is_said_in_words(tmp_path: Path) -> None:

@@ -210,6 +210,17 @@ def test_a_recording_is_not_removed_to_make_room_for_its_flight(
     assert (out / name / "recording.toml").exists()
 
 
+def test_a_live_flight_records_in_its_folder(recording: Recording, tmp_path: Path) -> None:
+    """Whatever an earlier one has left there is not the recording to be flown."""
+    out = tmp_path / "out"
+    shutil.copytree(recording.path, out / "recording")
+    plan = plan_flight(read_recording(out / "recording"), FlyOptions())
+    (out / "run").mkdir()
+    (out / "run" / "flight.json").write_text("{}")
+    prepare_folder(out, plan, records=True)
+    assert not (out / "recording").exists()
+
+
 def test_the_output_folder_is_cleared_of_flights_and_of_nothing_else(
     recording: Recording, tmp_path: Path
 ) -> None:

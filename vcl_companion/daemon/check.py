@@ -21,7 +21,7 @@ from vcl_companion.daemon.check_host import Check, Grade, of_camera, of_files, o
 from vcl_companion.daemon.check_motion import watch_motion
 from vcl_companion.daemon.frame_rules import of_frames
 from vcl_companion.daemon.parameter_rules import Finding, findings, names_of, rules_for
-from vcl_companion.errors import VclError
+from vcl_companion.errors import ConfigError, VclError
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.vision_pose import Firmware
 
@@ -85,9 +85,15 @@ async def set_parameters(
 
     Returns:
         The names of those that did not take their value.
+
+    Raises:
+        ConfigError: no autopilot is heard.
     """
     async with _linked(config, SystemClock()) as link:
-        await _heard_of(link)
+        if not await _heard_of(link):
+            raise ConfigError(
+                f"no heartbeat of an autopilot over {config.autopilot.link}: nothing is changed"
+            )
         asked = {name: await link.parameter(name) for name in values}
         before = {name: was for name, was in asked.items() if was is not None}
         if before:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -46,7 +47,10 @@ def read_before(path: Path) -> dict[str, float]:
     """
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
-        return {str(name): float(value) for name, value in values.items()}
+        before = {str(name): float(value) for name, value in values.items()}
+        if not before or not all(map(math.isfinite, before.values())):
+            raise ValueError
+        return before
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}: nothing to restore") from error
     except (ValueError, AttributeError, TypeError) as error:

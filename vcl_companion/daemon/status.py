@@ -79,9 +79,14 @@ class ServiceStatus:
         return time.time() - self.written_at_s
 
     @property
+    def is_of_now(self) -> bool:
+        """Whether it has just been written; one of the future is of another run's clock."""
+        return abs(self.age_s) < STALE_S
+
+    @property
     def is_good(self) -> bool:
         """Whether it is of now, and the autopilot flies by our poses."""
-        return self.age_s < STALE_S and self.state == "active" and self.autopilot.fusion == "fused"
+        return self.is_of_now and self.state == "active" and self.autopilot.fusion == "fused"
 
 
 def status_json(status: ServiceStatus) -> bytes:
@@ -122,7 +127,10 @@ def read_status(path: Path) -> ServiceStatus:
 def status_lines(status: ServiceStatus) -> list[str]:
     """Return it for people, a line for each thing."""
     autopilot, stored = status.autopilot, status.map
-    if status.age_s >= STALE_S:
+    if status.age_s <= -STALE_S:
+        when = f"written {-status.age_s:.0f} s from now, by a clock that was set back since"
+        lines = [f"drone {status.system_id}: {when}; it was"]
+    elif not status.is_of_now:
         lines = [f"drone {status.system_id}: not heard of for {status.age_s:.0f} s; it was"]
     else:
         lines = [f"drone {status.system_id}"]

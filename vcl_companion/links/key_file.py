@@ -90,9 +90,11 @@ def install_key_file(source: Path, target: Path, like: Path | None = None) -> Si
         The key.
 
     Raises:
-        ConfigError: the source is no key file, or the target cannot be written.
+        ConfigError: the source is no key file, the target is something else, or it cannot be
+            written.
     """
     passphrase = read_passphrase(source)
+    _check_may_go(target)
     partial = target.with_name(f".{target.name}.partial")
     try:
         about = None if like is None else like.stat()
@@ -113,6 +115,25 @@ def install_key_file(source: Path, target: Path, like: Path | None = None) -> Si
     return _key_of(passphrase)
 
 
+def _check_may_go(target: Path) -> None:
+    """Make sure that nothing but a key, or a file that is empty, is replaced by one.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    try:
+        with open(target, "rb", opener=_at_once) as file:
+            is_file = stat.S_ISREG(os.fstat(file.fileno()).st_mode)
+            text = file.read(_MAX_FILE_BYTES + 1) if is_file else b""
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{target}: cannot be installed ({_why(error)})") from error
+    text = text.strip()
+    if not is_file or (text and not _PASSPHRASE.fullmatch(text.decode("ascii", errors="replace"))):
+        raise ConfigError(f"{target}: is there, and is no key file; remove it, or name another one")
+
+
 def _at_once(path: str, flags: int) -> int:
     """Open without waiting: a pipe of that name may have nobody at its other end."""
     return os.open(path, flags | os.O_NONBLOCK)
@@ -121,11 +142,15 @@ def _at_once(path: str, flags: int) -> int:
 def _write(path: Path, passphrase: str, mode: int) -> None:
     """Write a file that is not there yet, and that nobody else could read for a moment."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
-    with open(descriptor, "w", encoding="ascii") as file:
-        os.fchmod(descriptor, mode)  # whatever the umask
-        file.write(passphrase + "\n")
-        file.flush()
-        os.fsync(descriptor)
+    try:
+        with open(descriptor, "w", encoding="ascii") as file:
+            os.fchmod(descriptor, mode)  # whatever the umask
+            file.write(passphrase + "\n")
+            file.flush()
+            os.fsync(descriptor)
+    except OSError:  # a full disk: what is left is no key, and would keep one from being made
+        path.unlink(missing_ok=True)
+        raise
 
 
 def _key_of(passphrase: str) -> SigningKey:
