@@ -92,6 +92,7 @@ def test_a_frame_sent_by_its_age_is_looked_for_again_when_the_clock_is_known(
             blob, again = await one.answer()
             assert again.captured_at_ns == demo.shot(2).at_ns + SECOND
             one.forget()
+            await passes(10.5)  # it has heard that the frame has arrived
             one.say(asked, 2)
             assert (await one.answer())[0] == blob
 
