@@ -98,7 +98,10 @@ def test_a_mistyped_value_names_path_expected_and_got(table: dict[str, Any], mes
         ('[camera]\nsource = "stream:h:99999"', "[camera] source: expected HOST:PORT"),
         ("system_id = 4\n[swarm]\nmembers = [1, 2]", "system_id: 4 is not in swarm.members [1, 2]"),
         ("[swarm]\nmembers = [1, 2]", "peers.to: is empty, and swarm.members names [2]"),
-        ("[peers]\nto = ['10.0.0.2:14650']\nkey_file = '/k'", "swarm.members: names no other drone"),
+        (
+            "[peers]\nto = ['10.0.0.2:14650']\nkey_file = '/k'",
+            "swarm.members: names no other drone",
+        ),
         ("[swarm]\nknown_distances = [[1, 2]]", "swarm.known_distances[0]: expected an array of 3"),
         (
             '[map]\ndetectors = ["akaze", "sift", "akaze"]',
