@@ -19,6 +19,7 @@ import numpy as np
 
 from sitl.mission import Mission
 from sitl.renderer import Imaging
+from sitl.scenario_numbers import refuse_absurd
 from sitl.town import Town
 from sitl.trajectories import Flight, FlightPath
 from vcl_companion.cameras.mounting import mounted_rotation
@@ -26,6 +27,7 @@ from vcl_companion.errors import ConfigError
 from vcl_companion.geometry.camera import Camera, DistortionModel
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.recording import Sensor
+from vcl_companion.text_file import read_text
 
 SCENARIOS = Path(__file__).resolve().parent / "scenarios"
 
@@ -235,6 +237,7 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
             raise ConfigError(f"{path}: based_on is one of {known}; got {base!r}")
         table = {**_table(SCENARIOS / f"{base}.toml"), **table}
     _refuse_unknown(table, Scenario, path, "")
+    refuse_absurd(table, path)
     try:
         return msgspec.convert(table, Scenario)
     except msgspec.ValidationError as error:
@@ -244,7 +247,7 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
 def _table(path: Path) -> dict[str, Any]:
     """Return what a file says, or raise ConfigError in one line."""
     try:
-        return tomllib.loads(path.read_text("utf-8"))
+        return tomllib.loads(read_text(path))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, RecursionError) as error:

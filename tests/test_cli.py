@@ -46,6 +46,22 @@ def test_a_broken_configuration_is_one_line_and_status_2(tmp_path: Path) -> None
     )
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@pytest.mark.parametrize("arguments", [["--help"], ["keys", "new", "{folder}/k.key"]])
+def test_a_full_standard_output_is_one_line(tmp_path: Path, arguments: list[str]) -> None:
+    words = [word.format(folder=tmp_path) for word in arguments]
+    with open("/dev/full", "w") as full:
+        result = subprocess.run(
+            [sys.executable, "-m", "vcl_companion.cli", *words],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert result.returncode == 1
+    assert result.stderr == "vcl: standard output: No space left on device\n"
+
+
 def test_a_missing_configuration_names_the_file(tmp_path: Path) -> None:
     result = CliRunner().invoke(main, ["run", "--config", str(tmp_path / "none.toml")])
     assert result.exit_code == 2

@@ -1,3 +1,4 @@
+import os
 import string
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
@@ -92,7 +93,10 @@ def test_a_mistyped_value_names_path_expected_and_got(table: dict[str, Any], mes
         ('[camera]\nlevel = "x"', "camera.level: unknown key; the nearest valid key is log.level"),
         ('[log]\n"a b\\u001b" = 1', 'log."a b\\u001b": unknown key; the nearest valid key is log.'),
         ("[camera]\nrate_hz = true", "camera.rate_hz: expected a number, got true"),
-        ("[camera]\nrate_hz = nan", "camera.rate_hz: expected a finite number, got nan"),
+        (
+            "[camera]\nrate_hz = nan",
+            "camera.rate_hz: expected a finite number up to 1e+12, got",
+        ),
         ("[camera]\nrate_hz = -1.5", "[camera] rate_hz: must be in 0..240, got -1.5"),
         ('[camera]\nsource = "usb:0"', "[camera] source: expected one of v4l2:DEVICE"),
         ('[camera]\nsource = "stream:h:99999"', "[camera] source: expected HOST:PORT"),
@@ -108,7 +112,15 @@ def test_a_mistyped_value_names_path_expected_and_got(table: dict[str, Any], mes
             "[map] detectors: each once, got ['akaze', 'sift', 'akaze']",
         ),
         ("system_id = 256", "system_id: must be in 1..255, got 256"),
-        ("system_id = 0x" + "f" * 6000, "system_id: expected a 64-bit integer, got a huge integer"),
+        ("system_id = 0x" + "f" * 6000, "system_id: expected an integer up to 1e+12, got a huge"),
+        (
+            "[filter]\nacceleration_m_s2 = 1e299",
+            "filter.acceleration_m_s2: expected a finite number up to 1e+12, got 1e+299",
+        ),
+        (
+            "[swarm]\nheartbeat_timeout_s = 1e-320",
+            "swarm.heartbeat_timeout_s: expected 0 or a number from 1e-12 on, got 1e-320",
+        ),
         (
             "clock = 0x" + "f" * 6000,
             'clock: expected one of "system", "camera", got a huge integer',
@@ -125,6 +137,28 @@ def test_a_broken_file_is_one_line_that_says_where(text: str, message: str) -> N
     assert str(caught.value).startswith(f"drone.toml: {message}")
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize("is_pipe", [False, True])
+def test_a_configuration_is_a_file_that_ends(tmp_path: Path, is_pipe: bool) -> None:
+    path = Path("/dev/zero")
+    if is_pipe:
+        path = tmp_path / "pipe.toml"
+        os.mkfifo(path)
+    with pytest.raises(ConfigError, match=f"^{path}: is no regular file$"):
+        load_config(path)
+
+
+def test_a_configuration_is_of_a_few_megabytes_and_may_have_a_byte_order_mark(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "drone.toml"
+    path.write_bytes(b"\xef\xbb\xbfsystem_id = 7\n")
+    assert load_config(path).system_id == 7
+    with path.open("wb") as file:
+        file.truncate(3 << 30)
+    with pytest.raises(ConfigError, match=r"drone.toml: is longer than 16 MiB$"):
+        load_config(path)
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ PACKAGE = "vcl_companion"
 
 # From the ground up. What stands on one shelf does not see its neighbours.
 SHELVES = (
-    ("errors", "clock", "options", "compiled"),
+    ("errors", "clock", "options", "compiled", "text_file"),
     ("geometry",),
     ("vision",),
     ("mapping",),

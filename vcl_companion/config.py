@@ -31,12 +31,15 @@ from vcl_companion.swarm.group import SwarmOptions
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.swarm.transfer_options import TransferOptions
 from vcl_companion.swarm.update_options import UpdateOptions
+from vcl_companion.text_file import read_text
 from vcl_companion.vision.features import Detector, FeatureOptions
 
 _Section = TypeVar("_Section")
 _Path = tuple[str | int, ...]
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _SHOWN_CHARACTERS = 40
+# Squared, and added up, it is a number still; what is larger is of another unit.
+_LARGEST = 1e12
 _NAMES = {bool: "true or false", int: "an integer", float: "a number", str: "a string"}
 
 
@@ -138,7 +141,7 @@ def load_config(path: Path) -> Config:
             the wrong type or out of bounds. Always one line that names the file.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
@@ -210,11 +213,13 @@ def _value(expected: Any, value: object, path: _Path) -> Any:
     if expected is Path and isinstance(value, str):
         return Path(value)
     if expected is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        if not -1e300 < value < 1e300:  # neither nan nor inf, nor an integer beyond them
-            raise _mistyped("a finite number", value, path)
+        if not abs(value) <= _LARGEST:  # nor nan, nor an integer that is no float
+            raise _mistyped(f"a finite number up to {_LARGEST:g}", value, path)
+        if 0 < abs(value) < 1 / _LARGEST:
+            raise _mistyped(f"0 or a number from {1 / _LARGEST:g} on", value, path)
         return float(value)
-    if expected is int and type(value) is int and not -(2**63) <= value < 2**63:
-        raise _mistyped("a 64-bit integer", value, path)
+    if expected is int and type(value) is int and not abs(value) <= _LARGEST:
+        raise _mistyped(f"an integer up to {_LARGEST:g}", value, path)
     if expected in (bool, int, str) and type(value) is expected:
         return value
     raise _mistyped(_NAMES.get(expected, "a string"), value, path)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NoReturn
 
 import click
 
-from vcl_companion.errors import VclError
+from vcl_companion.errors import DISK_IS_FULL, VclError, reason_of
 
 
 def tell(speaker: str, text: str) -> None:
@@ -34,14 +38,16 @@ class OneLineGroup(click.Group):
     ) -> click.Context:
         """Refuse options of the group itself in one line, too."""
         try:
-            return super().make_context(info_name, args, parent, **extra)
+            with self._output():  # of --help
+                return super().make_context(info_name, args, parent, **extra)
         except click.UsageError as error:
             self._refuse(error)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command."""
         try:
-            return super().invoke(ctx)
+            with self._output():
+                return super().invoke(ctx)
         except click.UsageError as error:
             self._refuse(error)
         except VclError as error:
@@ -50,6 +56,19 @@ class OneLineGroup(click.Group):
         except KeyboardInterrupt:
             tell(self.speaker, "interrupted")
             ctx.exit(130)
+
+    @contextmanager
+    def _output(self) -> Iterator[None]:
+        """Say in one line that what was to be printed cannot be; who reads no more is no error."""
+        try:
+            yield
+        except OSError as error:
+            if error.errno not in DISK_IS_FULL or error.filename is not None:
+                raise
+            tell(self.speaker, f"standard output: {reason_of(error)}")
+            # What is still to be written would fail again when the interpreter ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise click.exceptions.Exit(1) from None
 
     def _refuse(self, error: click.UsageError) -> NoReturn:
         if isinstance(error, click.exceptions.NoArgsIsHelpError):

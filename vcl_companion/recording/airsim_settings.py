@@ -22,6 +22,7 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, matrix_from_euler
 from vcl_companion.recording.sensor import BODY_FROM_CAM_FORWARD
+from vcl_companion.text_file import read_text
 
 _SCENE = 0  # ImageType of an ordinary picture
 _DEFAULT_WIDTH_PX, _DEFAULT_HEIGHT_PX, _DEFAULT_FOV_DEG = 256.0, 144.0, 90.0
@@ -141,7 +142,7 @@ def read_airsim_settings(path: Path) -> AirSimSettings:
         RecordingError: absent, or not a JSON object.
     """
     try:
-        table = json.loads(path.read_text("utf-8-sig"))
+        table = json.loads(read_text(path))
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
     except json.JSONDecodeError as error:

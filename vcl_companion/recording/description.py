@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vcl_companion.errors import RecordingError
+from vcl_companion.text_file import read_text
 
 _KEYS = (
     "name",
@@ -77,7 +78,7 @@ def read_description(path: Path) -> Description:
         RecordingError: it is not TOML, or a key is unknown or of the wrong type.
     """
     try:
-        table = tomllib.loads(path.read_text("utf-8-sig"))
+        table = tomllib.loads(read_text(path))
     except FileNotFoundError:
         return Description()
     except OSError as error:

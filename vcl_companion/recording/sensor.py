@@ -22,6 +22,7 @@ from vcl_companion.errors import RecordingError
 from vcl_companion.geometry.camera import Camera, DistortionModel
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, orthonormalized
+from vcl_companion.text_file import read_text
 
 ReferenceAxes = Literal["NED", "ENU", "NWU"]
 
@@ -196,7 +197,7 @@ def read_fields(path: Path) -> dict[str, object]:
     try:
         if path.stat().st_size > _MAX_FILE_BYTES:
             raise RecordingError(f"{path}: too large for a sensor.yaml")
-        fields = yaml.load(path.read_text("utf-8-sig"), Loader=yaml.BaseLoader)
+        fields = yaml.load(read_text(path, _MAX_FILE_BYTES), Loader=yaml.BaseLoader)
     except FileNotFoundError:
         raise RecordingError(f"{path}: missing; the calibration of this sensor is needed") from None
     except OSError as error:
