@@ -18,6 +18,7 @@ def test_a_swarm_of_which_no_distance_is_known_is_warned(
     members: tuple[int, ...], distances: tuple[tuple[int, int, float], ...], warned: bool
 ) -> None:
     swarm = SwarmOptions(members, known_distances=distances)
-    config = Config(system_id=1, swarm=swarm, peers=PeerOptions(allow_unsigned=True))
+    others = tuple("127.0.0.1:9" for member in members if member != 1)
+    config = Config(system_id=1, swarm=swarm, peers=PeerOptions(to=others, allow_unsigned=True))
     found = [check for check in of_files(config) if check.name == "swarm"]
     assert [check.grade for check in found] == (["warning"] if warned else [])
