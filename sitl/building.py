@@ -53,14 +53,6 @@ class Building(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     roof_deg: float = 42.0
     seed: int = 0
 
-    def __post_init__(self) -> None:
-        if min(self.width_m, self.depth_m, self.height_m) < 2.0:
-            raise ValueError("building: width_m, depth_m and height_m are 2 m or more")
-        if min(self.columns, self.floors, self.bays) < 0 or min(self.relief, self.detail) < 0.0:
-            raise ValueError("building: columns, floors, bays, relief, detail are not negative")
-        if not 0.0 <= self.alike <= 1.0 or not 5.0 <= self.roof_deg <= 70.0:
-            raise ValueError("building: alike is 0 to 1, roof_deg is 5 to 70")
-
 
 class _Site:
     """A wall while it grows: its grid of windows, its faces, its generator."""

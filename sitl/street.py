@@ -46,10 +46,8 @@ class Street(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.length_m < 5.0 or self.road_m < 2.0 or self.pavement_m < 0.0:
-            raise ValueError("street: 5 m or longer, road_m 2 or more, pavement_m not negative")
-        if not 0.0 <= self.parked <= 1.0 or self.lamp_every_m < 0.0:
-            raise ValueError("street: parked is 0 to 1, lamp_every_m is not negative")
+        if self.length_m < 5.0 or 0.0 < self.lamp_every_m < 1.0:
+            raise ValueError("street: 5 m or longer, lamp_every_m is 0 or 1 m and more")
 
     @property
     def length_m(self) -> float:

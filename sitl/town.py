@@ -16,6 +16,7 @@ from sitl.world import Texture, World
 
 _PAVEMENT_TEXELS_PER_M = 32.0
 _SKY_TEXELS = 1024
+_MOST_TEXELS = 2**30  # of all that stands there: 4 GiB while it is painted
 _UPRIGHT: tuple[Side, ...] = ("front", "left", "right", "top", "back")
 
 
@@ -40,6 +41,10 @@ class Clutter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     count: int = 8
     min_size_m: float = 0.5
     max_size_m: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.min_size_m > self.max_size_m:
+            raise ValueError("clutter: min_size_m is at most max_size_m")
 
 
 class Town(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -69,11 +74,24 @@ class Town(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tree: tuple[Tree, ...] = ()
 
     def __post_init__(self) -> None:
-        if not 2.0 <= self.texels_per_m <= 200.0 or not 1.0 <= self.ground_half_m <= 1000.0:
-            raise ValueError("town: texels_per_m is 2 to 200, ground_half_m is 1 to 1000")
-        if not 1.0 <= self.ground_texels_per_m <= 40.0:
-            raise ValueError("town: ground_texels_per_m is 1 to 40")
+        if (area_m2 := self._painted_m2()) * self.texels_per_m**2 > _MOST_TEXELS:
+            raise ValueError(
+                f"town: {area_m2:.0f} m2 of walls, pavements and streets are too much to paint by "
+                f"{self.texels_per_m:g} texels_per_m; "
+                f"at most {_MOST_TEXELS / self.texels_per_m**2:.0f} m2"
+            )
         self.sun()
+
+    def _painted_m2(self) -> float:
+        """Return about how much there is to paint but for the ground."""
+        return sum(
+            (
+                *(2 * (b.width_m + b.depth_m) * b.height_m for b in self.building),
+                *(p.length_x_m * p.length_y_m for p in self.pavement),
+                *(5 * c.count * c.max_size_m**2 for c in self.clutter),
+                *(s.length_m * (s.road_m + 2 * s.pavement_m) for s in self.street),
+            )
+        )
 
     def sun(self) -> Sun:
         """Return where the light comes from."""

@@ -6,15 +6,19 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
 from sitl.render import TRUTH_SIGMA_M, render_scenario
 from sitl.renderer import Renderer
 from sitl.scenario import SCENARIOS, Scenario, load_scenario, scenario_names
+from sitl.scenario_ranges import RANGES
 from sitl.town import build_town
 from sitl.trajectories import Flight, FlightPath, Sway, Wobble
 from sitl.world import World
@@ -80,20 +84,7 @@ def test_every_scenario_that_comes_with_the_harness_loads() -> None:
         ("duration_s", "duration", "'duration'.*'duration_s'"),
         ("width_m = 8.0", 'width_m = "wide"', r"float.*str.*world.building\[0\].width_m"),
         ("x_m = 9.0\n", "", "missing required field `x_m`"),
-        (
-            "focal_px = 60.0",
-            "focal_px = -1.0",
-            r"camera.focal_px: is -1.0, and goes from 1 to 100000",
-        ),
-        ('name = "small"', 'seed = -1\nname = "small"', r"seed: is -1, and goes from 0 to"),
-        ("x_m = 9.0", "x_m = nan", r"world.building\[0\].x_m: is nan, and goes from -100000 to"),
-        ("facing_deg = ", "facing_deg = inf # ", r"facing_deg: is inf"),
-        (
-            "width_m = 8.0",
-            "width_m = 1e9",
-            r"building\[0\].width_m: is 1000000000.0, and goes .* 1000",
-        ),
-        ("[2.0, 1.0, 0.5", "[2.0, nan, 0.5", r"waypoints\[1\]\[1\]: is nan"),
+        ("focal_px = 60.0", "focal_px = -1.0", "camera.focal_px is 1 to 100000; got -1"),
         ("0.01, 0.0, 0.0]", "-0.6, 0.0, 0.0]", "camera: its corners look 90 degrees.*camera"),
         ("[-0.1, 0.01, 0.0, 0.0]", "[-0.1]", "coefficients"),
         ('["mav0", "mav1"]', '["mav0", "mav7"]', "no drone 'mav7'"),
@@ -110,6 +101,72 @@ def test_a_wrong_scenario_gets_one_line_that_names_the_key(
         load_text(tmp_path, SMALL.replace(old, new, 1))
     assert "a scenario.toml" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("duration_s", "seed = -1\nduration_s", "seed is 0 to 4294967295; got -1"),
+        ("focal_px = 60.0", "focal_px = 1e-300", "camera.focal_px is 1 to 100000; got 1e-300"),
+        ("[0.1, 0.02", "[nan, 0.02", "camera.position_m[0] is -100 to 100; got nan"),
+        ('"png"', '"png"\ngain = 1e300', "image.gain is 0.01 to 100; got 1e+300"),
+        ('"png"', '"png"\nblur_px = 1e6', "image.blur_px is 0 to 50; got 1e+06"),
+        ("[world]", "[world]\nsun_strength = 1e300", "world.sun_strength is 0 to 10; got 1e+300"),
+        ("width_m = 8.0", "width_m = 1e9", "world.building[0].width_m is 2 to 300; got 1e+09"),
+        ("180.0", "inf", "world.building[0].facing_deg is -360 to 360; got inf"),
+        ("width_m", "bays = 1000000000\nwidth_m", "building[0].bays is 0 to 20; got 1000000000"),
+        ("[2.0, 1.0", "[2.0, nan", "flight.waypoints[1][1] is -100000 to 100000; got nan"),
+        ("delay_s = 0.003", "delay_s = -1", "drone[1].delay_s is 0 to 10; got -1"),
+    ],
+)
+def test_a_number_out_of_its_range_is_one_line_with_key_and_range(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_text(tmp_path, SMALL.replace(old, new, 1))
+    path = tmp_path / "a scenario.toml"
+    assert str(caught.value).startswith(f"{path}: ")
+    assert str(caught.value).endswith(message)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {
+                "width_m = 8.0": "width_m = 300.0\nheight_m = 300.0",
+                "texels_per_m = 10": "texels_per_m = 100",
+            },
+            "185400 m2 of walls.*at most 107374 m2",
+        ),
+        (
+            {"width_px = 96": "width_px = 8192", "height_px = 64": "height_px = 4096"},
+            "supersampling.2 is at most 67108864; got 134217728",
+        ),
+    ],
+)
+def test_what_is_too_much_together_is_refused(
+    tmp_path: Path, changes: dict[str, str], message: str
+) -> None:
+    text = SMALL.replace("focal_px = 60.0", "focal_px = 5000.0").replace("distortion", "#")
+    for old, new in changes.items():
+        text = text.replace(old, new, 1)
+    with pytest.raises(ConfigError, match=message):
+        load_text(tmp_path, text)
+
+
+def test_every_number_of_a_scenario_has_a_range() -> None:
+    def numbers(kind: Any, key: str) -> Iterator[str]:
+        if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+            for name, inner in get_type_hints(kind).items():
+                yield from numbers(inner, f"{key}.{name}".lstrip("."))
+        elif kind in (int, float):
+            yield key
+        elif get_origin(kind) is not Literal:
+            for inner in get_args(kind):
+                yield from numbers(inner, key)
+
+    assert set(numbers(Scenario, "")) == set(RANGES)
 
 
 def test_an_unknown_scenario_names_the_known_ones(tmp_path: Path) -> None:
