@@ -21,11 +21,15 @@ def read_text(path: Path, most_bytes: int = _MOST_BYTES) -> str:
         OSError: it cannot be read, is no file, or too long.
         UnicodeDecodeError: it is no UTF-8 text.
     """
-    # Without waiting: a pipe may have nobody at its other end.
-    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+    with open(path, "rb", opener=at_once) as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise OSError(errno.EINVAL, "is no regular file")
         data = file.read(most_bytes + 1)
     if len(data) > most_bytes:
         raise OSError(errno.EFBIG, f"is longer than {most_bytes >> 20} MiB")
     return data.decode("utf-8-sig")
+
+
+def at_once(path: str, flags: int) -> int:
+    """Open a file without waiting: a pipe of that name may have nobody at its other end."""
+    return os.open(path, flags | os.O_NONBLOCK)

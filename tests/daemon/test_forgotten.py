@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 from tests.daemon import demo
-from tests.daemon.swarm import Drone, swarm
+from tests.daemon.swarm import Drone, Swarm, swarm
 from tests.daemon.waiting import run, until
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.mailbox import Mailbox
 from vcl_companion.daemon.map_search import MapSearch
+from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.daemon.odometry import Odometry
 from vcl_companion.daemon.own_fixes import OwnFixes
 from vcl_companion.geometry.rotation import exp_so3
@@ -25,6 +26,16 @@ from vcl_companion.localization.localization_options import LocalizationOptions
 from vcl_companion.localization.pipeline import PipelineOptions
 from vcl_companion.localization.pose_filter import FilterOptions
 from vcl_companion.localization.tracking import TrackingOptions
+
+
+async def placed(members: Swarm) -> tuple[Drone, StoredMap]:
+    """Start a drone that knows where it took its first picture; return also its map."""
+    drone = await members.start(2, (1, 2))
+    await until(lambda: drone.autopilot_link.is_heard)
+    await drone.see(demo.frame(2))
+    drone.track(50)
+    assert drone.maps.current is not None
+    return drone, drone.maps.current
 
 
 def own_fixes_of(drone: Drone, executor: ThreadPoolExecutor) -> OwnFixes:
@@ -40,12 +51,7 @@ def own_fixes_of(drone: Drone, executor: ThreadPoolExecutor) -> OwnFixes:
 def test_a_frame_that_is_being_looked_at_is_looked_at_again(tmp_path: Path) -> None:
     async def scenario(executor: ThreadPoolExecutor) -> None:
         async with swarm(1, 2, path=tmp_path) as members:
-            drone = await members.start(2, (1, 2))
-            await until(lambda: drone.autopilot_link.is_heard)
-            await drone.see(demo.frame(2))
-            drone.track(50)
-            stored = drone.maps.current
-            assert stored is not None
+            drone, stored = await placed(members)
             own_fixes = own_fixes_of(drone, executor)
             for forgets in (False, True):
                 may_begin = threading.Event()
@@ -69,12 +75,7 @@ def test_a_frame_that_is_being_searched_for_is_searched_for_again(
 ) -> None:
     async def scenario() -> None:
         async with swarm(1, 2, path=tmp_path) as members:
-            drone = await members.start(2, (1, 2))
-            await until(lambda: drone.autopilot_link.is_heard)
-            await drone.see(demo.frame(2))
-            drone.track(50)
-            stored = drone.maps.current
-            assert stored is not None
+            drone, stored = await placed(members)
             search = MapSearch(Mailbox(), drone.maps, drone.estimator, drone.work)
             priors: list[object] = []
             find = drone.work.find

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from vcl_companion.errors import ConfigError
 from vcl_companion.links.signing import SECRET_BYTES, SigningKey
+from vcl_companion.text_file import at_once
 
 _PASSPHRASE = re.compile(rf"[0-9a-f]{{{2 * SECRET_BYTES}}}")
 _MAX_FILE_BYTES = 1024
@@ -58,7 +59,7 @@ def read_passphrase(path: Path) -> str:
         ConfigError: as ``read_key_file``.
     """
     try:
-        with open(path, "rb", opener=_at_once) as file:
+        with open(path, "rb", opener=at_once) as file:
             about = os.fstat(file.fileno())
             if not stat.S_ISREG(about.st_mode):
                 raise ConfigError(f"{path}: is no file")
@@ -122,7 +123,7 @@ def _check_may_go(target: Path) -> None:
         ConfigError: it is something else.
     """
     try:
-        with open(target, "rb", opener=_at_once) as file:
+        with open(target, "rb", opener=at_once) as file:
             is_file = stat.S_ISREG(os.fstat(file.fileno()).st_mode)
             text = file.read(_MAX_FILE_BYTES + 1) if is_file else b""
     except FileNotFoundError:
@@ -132,11 +133,6 @@ def _check_may_go(target: Path) -> None:
     text = text.strip()
     if not is_file or (text and not _PASSPHRASE.fullmatch(text.decode("ascii", errors="replace"))):
         raise ConfigError(f"{target}: is there, and is no key file; remove it, or name another one")
-
-
-def _at_once(path: str, flags: int) -> int:
-    """Open without waiting: a pipe of that name may have nobody at its other end."""
-    return os.open(path, flags | os.O_NONBLOCK)
 
 
 def _write(path: Path, passphrase: str, mode: int) -> None:

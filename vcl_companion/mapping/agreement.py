@@ -129,9 +129,7 @@ def _in_common(old: LandmarkMap, new: LandmarkMap) -> list[tuple[int, int]]:
 
 def _scene_m(landmark_map: LandmarkMap) -> float:
     """Return how far the landmarks are from the keyframes that see them, m."""
-    seen = landmark_map.seen
-    bodies = np.array([k.world_from_body.translation for k in landmark_map.keyframes])
-    away = np.linalg.norm(landmark_map.points_world[:, None] - bodies, axis=2)[seen]
+    away = landmark_map.ranges_m()[landmark_map.seen]
     return float(np.median(away)) if len(away) else 0.0
 
 

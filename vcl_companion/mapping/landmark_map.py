@@ -152,6 +152,11 @@ class LandmarkMap:
         """How many pixels its images have, all together."""
         return sum(k.camera.width_px * k.camera.height_px for k in self.keyframes)
 
+    def ranges_m(self) -> Array:
+        """Return (N, V) how far each landmark is from the body of each keyframe, m."""
+        bodies = np.array([k.world_from_body.translation for k in self.keyframes])
+        return np.asarray(np.linalg.norm(self.points_world[:, None] - bodies, axis=2))
+
     @property
     def seen(self) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
         """(N, V) whether landmark j was seen in keyframe i."""

@@ -113,8 +113,7 @@ def accepted(landmark_map: LandmarkMap, options: MapOptions) -> LandmarkMap | No
         sure = map_uncertainty(landmark_map, options.calibration_px)
     except ValueError as error:
         return NoMap(str(error))
-    bodies = np.array([k.world_from_body.translation for k in landmark_map.keyframes])
-    away = np.linalg.norm(landmark_map.points_world[:, None] - bodies, axis=2)
+    away = landmark_map.ranges_m()
     away[~landmark_map.seen] = np.inf
     nearest = away.argmin(axis=1)
     covariance = sure.seen_from(landmark_map.keyframes, nearest)
