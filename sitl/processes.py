@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Coroutine, Iterable, Mapping, Sequence
@@ -22,6 +23,8 @@ _KILL_WAIT_S = 5.0
 # A broken pipe or socket is seen before the exit of the process behind it; look twice.
 _BLAME_WAIT_S = 2.0
 _LOOK_S = 0.05
+# A disk with less has no room for a last word.
+_FULL_BYTES = 4096
 
 
 class FlightError(VclError):
@@ -67,8 +70,12 @@ class Child:
             how = f"was ended by {_signal_name(-code)}"
         else:
             how = f"ended with exit code {code}"
-        words = self.last_words()
-        return f"{self.name} {how}: {words}" if words else f"{self.name} {how} without a word"
+        if words := self.last_words():
+            return f"{self.name} {how}: {words}"
+        folder = self.stderr_path.parent
+        if folder.is_dir() and shutil.disk_usage(folder).free < _FULL_BYTES:
+            return f"{self.name} {how}: the disk of {folder} is full"
+        return f"{self.name} {how} without a word"
 
 
 async def start_child(

@@ -242,7 +242,7 @@ class Swarm:
         path = self._run_folder(drone.planned) / "daemon.toml"
         child = await start_child(
             f"daemon of {name}",
-            (sys.executable, "-m", "vcl_companion.cli", "run", "--config", str(path)),
+            (sys.executable, "-m", "vcl_companion", "run", "--config", str(path)),
             log_prefix=path.with_name(f"daemon-{len(lives)}" if lives else "daemon"),
             environment=_environment(),
         )

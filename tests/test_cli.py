@@ -34,7 +34,7 @@ def test_a_broken_configuration_is_one_line_and_status_2(tmp_path: Path) -> None
     file = tmp_path / "drone.toml"
     file.write_text("[camera]\nsorce = 'oak'\n")
     result = subprocess.run(
-        [sys.executable, "-m", "vcl_companion.cli", "run", "--config", str(file)],
+        [sys.executable, "-m", "vcl_companion", "run", "--config", str(file)],
         capture_output=True,
         text=True,
         check=False,
@@ -52,7 +52,7 @@ def test_a_full_standard_output_is_one_line(tmp_path: Path, arguments: list[str]
     words = [word.format(folder=tmp_path) for word in arguments]
     with open("/dev/full", "w") as full:
         result = subprocess.run(
-            [sys.executable, "-m", "vcl_companion.cli", *words],
+            [sys.executable, "-m", "vcl_companion", *words],
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
@@ -98,7 +98,7 @@ def test_ctrl_c_is_one_line_and_status_130() -> None:
             order = ["ground", "resume", "--link", f"tcp:127.0.0.1:{drone.getsockname()[1]}"]
             with (
                 subprocess.Popen(
-                    [sys.executable, "-m", "vcl_companion.cli", *order],
+                    [sys.executable, "-m", "vcl_companion", *order],
                     stdout=subprocess.PIPE,
                     stderr=subprocess.PIPE,
                     text=True,

@@ -63,6 +63,15 @@ def test_a_key_is_made_shown_and_installed(tmp_path: Path, key: Path) -> None:
     assert fingerprint(vcl("show", installed)[1]) == fingerprint(said) != fingerprint(shown)
 
 
+def test_a_key_that_went_through_an_editor_with_byte_order_marks_is_read(
+    tmp_path: Path, key: Path
+) -> None:
+    marked = tmp_path / "marked.key"
+    marked.write_bytes(b"\xef\xbb\xbf" + key.read_bytes())
+    marked.chmod(0o600)
+    assert fingerprint(vcl("show", marked)[1]) == fingerprint(vcl("show", key)[1])
+
+
 def test_the_secret_is_shown_on_request_as_ground_stations_take_it(key: Path) -> None:
     status, shown = vcl("show", "--secret", key)
     passphrase = re.search(r"\npassphrase: ([0-9a-f]{64})\n", shown)
@@ -155,7 +164,7 @@ def test_a_daemon_does_not_start_without_its_key(tmp_path: Path, mode: int | Non
         f"[peers]\nto = ['127.0.0.1:9']\nkey_file = '{key}'\n"
     )
     result = subprocess.run(
-        [sys.executable, "-m", "vcl_companion.cli", "run", "--config", str(config)],
+        [sys.executable, "-m", "vcl_companion", "run", "--config", str(config)],
         capture_output=True,
         text=True,
         check=False,

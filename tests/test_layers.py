@@ -27,6 +27,7 @@ SHELVES = (
     ("config", "one_line"),
     ("daemon", "ground"),
     ("cli",),
+    ("__main__",),
 )
 HEIGHT = {room: height for height, shelf in enumerate(SHELVES) for room in shelf}
 

@@ -38,8 +38,17 @@ _Section = TypeVar("_Section")
 _Path = tuple[str | int, ...]
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _SHOWN_CHARACTERS = 40
-# Squared, and added up, it is a number still; what is larger is of another unit.
-_LARGEST = 1e12
+# What is larger, or above 0 and smaller, is of another unit: by how a key ends, whatever more
+# its class says.
+_LARGEST_OF = {
+    "_deg": 360.0,
+    "_m": 1e5,
+    "_px": 1e4,
+    "_hz": 1e4,
+    "_s": 1e7,  # speeds, and bytes per second, as well
+    "_bytes": 1e12,
+}
+_LARGEST, _LEAST = 1e6, 1e-9
 _NAMES = {bool: "true or false", int: "an integer", float: "a number", str: "a string"}
 
 
@@ -212,17 +221,23 @@ def _value(expected: Any, value: object, path: _Path) -> Any:
         return _section(expected, value, path)
     if expected is Path and isinstance(value, str):
         return Path(value)
+    largest = _largest(path)
     if expected is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        if not abs(value) <= _LARGEST:  # nor nan, nor an integer that is no float
-            raise _mistyped(f"a finite number up to {_LARGEST:g}", value, path)
-        if 0 < abs(value) < 1 / _LARGEST:
-            raise _mistyped(f"0 or a number from {1 / _LARGEST:g} on", value, path)
+        if not abs(value) <= largest:  # nor nan, nor an integer that is no float
+            raise _mistyped(f"a finite number up to {largest:.0f}", value, path)
+        if 0 < abs(value) < _LEAST:
+            raise _mistyped(f"0 or a number from {_LEAST:g} on", value, path)
         return float(value)
-    if expected is int and type(value) is int and not abs(value) <= _LARGEST:
-        raise _mistyped(f"an integer up to {_LARGEST:g}", value, path)
+    if expected is int and type(value) is int and not abs(value) <= largest:
+        raise _mistyped(f"an integer up to {largest:.0f}", value, path)
     if expected in (bool, int, str) and type(value) is expected:
         return value
     raise _mistyped(_NAMES.get(expected, "a string"), value, path)
+
+
+def _largest(path: _Path) -> float:
+    key = next((part for part in reversed(path) if isinstance(part, str)), "")
+    return next((most for unit, most in _LARGEST_OF.items() if key.endswith(unit)), _LARGEST)
 
 
 def _tuple(arguments: tuple[Any, ...], value: object, path: _Path) -> tuple[Any, ...]:

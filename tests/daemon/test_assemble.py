@@ -95,7 +95,7 @@ def daemon(
     }
     (path / "vcl.toml").write_text(toml_text(config))
     with subprocess.Popen(
-        [sys.executable, "-m", "vcl_companion.cli", "run", "--config", str(path / "vcl.toml")],
+        [sys.executable, "-m", "vcl_companion", "run", "--config", str(path / "vcl.toml")],
         cwd=ROOT,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,

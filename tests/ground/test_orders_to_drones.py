@@ -23,7 +23,7 @@ async def vcl_ground(port: int, *arguments: str) -> tuple[int, list[str]]:
     """Run the command; return its exit status and what it has printed."""
     hurry(0.0)  # the test's bound counts from here
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "vcl_companion.cli", "ground", *arguments),
+        *(sys.executable, "-m", "vcl_companion", "ground", *arguments),
         *("--link", f"udpin:127.0.0.1:{port}", "--drone", "1"),
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,

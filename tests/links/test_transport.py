@@ -14,8 +14,8 @@ from vcl_companion.errors import ConfigError
 from vcl_companion.links.counters import LinkTally
 from vcl_companion.links.datagram import UdpListener
 from vcl_companion.links.reconnect import Backoff
-from vcl_companion.links.stream import MAX_WAITING_BYTES
-from vcl_companion.links.transport import LinkAddress, open_transport, parse_link
+from vcl_companion.links.stream import MAX_WAITING_BYTES, SerialTransport
+from vcl_companion.links.transport import LinkAddress, open_transport, parse_link, parse_peers
 
 QUICK = Backoff(0.001, 0.01)
 
@@ -38,6 +38,33 @@ def test_a_wrong_link_string_is_one_clear_line(link: str) -> None:
     with pytest.raises(ConfigError, match="link") as caught:
         open_transport(link, LinkTally())
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("listen", "to", "message"),
+    [
+        ("239.1.1.1:14650", ["10.0.0.2:14650"], "listen: 239.1.1.1 is a multicast group"),
+        ("0.0.0.0:0", ["10.0.0.2:14650"], "listen: 0.0.0.0:0 needs a port above 0"),
+        ("0.0.0.0:14650", ["10.0.0.2:0"], "to: 10.0.0.2 needs a port above 0"),
+        ("0.0.0.0:14650", ["::1:14650"], "to: expected a numeric IPv4 ADDRESS:PORT, got '::1:146"),
+        ("0.0.0.0:14650", ["[::1]:14650"], "to: expected a numeric IPv4 ADDRESS:PORT"),
+        ("drone:14650", [], "listen: expected a numeric IPv4 ADDRESS:PORT, got 'drone:14650'"),
+        ("0.0.0.0", [], "listen: expected a numeric IPv4 ADDRESS:PORT, got '0.0.0.0'"),
+    ],
+)
+def test_a_wrong_address_of_the_swarm_is_one_clear_line(
+    listen: str, to: list[str], message: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_peers(listen, to)
+    assert str(caught.value).startswith(message)
+
+
+def test_a_serial_port_that_cannot_be_opened_is_named_once(tmp_path: Path) -> None:
+    transport = open_transport(f"serial:{tmp_path / 'none'}:9600", LinkTally(), backoff=QUICK)
+    assert isinstance(transport, SerialTransport)
+    with pytest.raises(OSError, match=r"^No such file or directory$"):
+        asyncio.run(transport._open())
 
 
 def test_allowed_senders_are_addresses_or_networks() -> None:

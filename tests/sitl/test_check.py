@@ -290,6 +290,7 @@ def test_an_autopilot_that_is_not_there_is_said_in_words(tmp_path: Path) -> None
     assert "no heartbeat of system 3" in line
     assert "Traceback" not in result.output
     assert check(config_of(tmp_path, 9), "--fix", "--restore").exit_code == 2
+    assert check(config_of(tmp_path, 9), "--tilt", "--restore").exit_code == 2
 
 
 @pytest.mark.parametrize(
@@ -307,7 +308,7 @@ def test_an_autopilot_that_is_not_there_is_said_in_words(tmp_path: Path) -> None
         (Firmware.ARDUPILOT, PARAMETERS, "VISO_SCALE", 2.0, "dangerous"),
         (Firmware.ARDUPILOT, PARAMETERS, "VISO_POS_Z", 0.1, "dangerous"),
         (Firmware.ARDUPILOT, PARAMETERS, "VISO_QUAL_MIN", 1.0, "prevents"),
-        (Firmware.ARDUPILOT, PARAMETERS, "VISO_POS_M_NSE", 0.2, "warns"),
+        (Firmware.ARDUPILOT, PARAMETERS, "VISO_POS_M_NSE", 0.1, "warns"),
         (Firmware.ARDUPILOT, PARAMETERS, "GPS1_TYPE", 1.0, "warns"),
         (Firmware.PX4, PX4, "EKF2_EV_CTRL", 0.0, "prevents"),
         (Firmware.PX4, PX4, "EKF2_EV_CTRL", 15.0, "prevents"),

@@ -2,11 +2,13 @@
 
 import asyncio
 import os
+import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Coroutine
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -73,6 +75,18 @@ def test_a_killed_process_says_by_what(tmp_path: Path) -> None:
         child = await started(tmp_path, "daemon", LONG)
         child.process.kill()
         with pytest.raises(FlightError, match="daemon was ended by SIGKILL without a word"):
+            await unless_one_ends([child], forever())
+
+    soon(work())
+
+
+def test_who_had_no_room_for_a_last_word_is_known_by_the_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def work() -> None:
+        child = await started(tmp_path, "daemon", "raise SystemExit(1)")
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
+        with pytest.raises(FlightError, match=r"daemon ended with exit code 1: the disk of .* is "):
             await unless_one_ends([child], forever())
 
     soon(work())

@@ -172,7 +172,7 @@ def load_depthai() -> Any:
     try:
         return importlib.import_module("depthai")
     except ImportError as error:
-        raise DeviceError("depthai is not installed (pip install 'vcl-companion[oak]')") from error
+        raise DeviceError("depthai is not installed (pip install '.[oak]')") from error
 
 
 def send_frames(queue: Any, dai: Any, intrinsics_px: Sequence[float], out: BinaryIO) -> None:

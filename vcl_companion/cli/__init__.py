@@ -41,7 +41,7 @@ def main() -> None:
 @main.command()
 @_config_option("The daemon's configuration (systemd/vcl-companion.toml documents every setting).")
 def run(config_path: Path) -> None:
-    """Run the daemon of one drone until SIGTERM or Ctrl-C.
+    """Run the daemon of one drone until SIGTERM, SIGHUP, Ctrl-C or the end of a recording.
 
     Exit status: 0 after a clean end, 2 when the configuration or a device
     cannot be used, another when it failed.
@@ -95,7 +95,7 @@ def status(config_path: Path, as_json: bool) -> None:
 @_config_option("The configuration of the daemon, which must not run meanwhile.")
 @click.option("--json", "as_json", is_flag=True, help="For programs; changes nothing.")
 @click.option("--fix", is_flag=True, help="Set the autopilot's parameters that are wrong.")
-@click.option("--yes", is_flag=True, help="With --fix or --restore: do not ask.")
+@click.option("--yes", is_flag=True, help="Ask nothing.")
 @click.option("--restore", is_flag=True, help="Put back what --fix has changed.")
 @click.option("--tilt", is_flag=True, help="Check the axes as well: turn the drone by hand.")
 def check(
@@ -116,6 +116,8 @@ def check(
 
     if sum((as_json, fix, restore)) > 1:
         raise ConfigError("check: --json, --fix and --restore are each for themselves")
+    if restore and tilt:
+        raise ConfigError("check: --restore looks at nothing, and --tilt does")
     config = load_config(config_path)
     kept = config_path.with_suffix(".parameters.json")
     context = click.get_current_context()

@@ -30,6 +30,7 @@ from vcl_companion.daemon.companion import Companion
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.exchange import Exchange, ExchangeOptions
 from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.forked import END_SIGNALS
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.local_frame import origin_in_leaders_world
@@ -73,11 +74,10 @@ _N_READERS = 4
 # A clock that a stream tells the time moves in steps of 20 ms, and is told them late when
 # there is much to do.
 _TOLD_CLOCK_RESOLUTION_NS = 100_000_000
-_END_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 def run_daemon(config: Config) -> int:
-    """Run one drone's service until SIGTERM, Ctrl-C or the end of the camera's stream.
+    """Run one drone's service until SIGTERM, SIGHUP, Ctrl-C or the end of the camera's stream.
 
     Args:
         config: everything it can be told.
@@ -100,7 +100,7 @@ def run_daemon(config: Config) -> int:
     finally:
         # The interpreter gives handlers back to the system before it has ended:
         # a second SIGTERM must not kill what is about to end cleanly.
-        for number in _END_SIGNALS:
+        for number in END_SIGNALS:
             signal.signal(number, signal.SIG_IGN)
 
 
@@ -114,8 +114,10 @@ async def _run(config: Config) -> int:
 
     # Not the loop's own handlers: those vanish with it, and a second SIGTERM
     # would then kill a daemon that is about to end cleanly.
-    for number in _END_SIGNALS:
-        signal.signal(number, end)
+    for number in END_SIGNALS:
+        # `nohup` has the end of the terminal ignored.
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, end)
     clock: Clock = ManualClock() if config.clock == "camera" else SystemClock()
     sensor = read_calibration(config.camera)
     log = FlightLog(config.log.flight_log, clock)

@@ -51,7 +51,7 @@ class Check:
 
 
 def of_files(config: Config) -> Iterable[Check]:
-    """Look at calibration, key, known distance, disk."""
+    """Look at calibration, key, known distance, disk, and where files are to be."""
     yield _of_calibration(config.camera)
     if config.peers.key_file:
         try:
@@ -67,14 +67,46 @@ def of_files(config: Config) -> Iterable[Check]:
         yield Check("swarm", "warning", what, "swarm.known_distances, the same on every drone")
     folder = config.map.directory
     if folder:
-        there = Path(folder)
-        while not there.exists() and there != there.parent:
-            there = there.parent
-        free = shutil.disk_usage(there).free
+        free = shutil.disk_usage(_there_of(Path(folder))).free
         grade = "ok" if free > _GOOD_FREE_BYTES else "warning"
         grade = "failure" if free < _LEAST_FREE_BYTES else grade
         advice = "" if grade == "ok" else "make room: maps and logs are kept there"
         yield Check("disk", grade, f"{free / 1e6:.0f} MB free for {folder}", advice)
+    yield from _of_places(config)
+
+
+def _of_places(config: Config) -> Iterable[Check]:
+    """Look at whether what is written in flight can be: only what is wrong is said."""
+    files = {
+        "peers.timestamp_file": config.peers.timestamp_file,
+        "log.flight_log": config.log.flight_log,
+        "log.status_file": config.log.status_file,
+    }
+    for setting, text in files.items():
+        path = Path(text)
+        if text and path.is_absolute():  # others lie in the service's own folder, not in ours
+            if path.is_dir():
+                yield Check(setting, "failure", f"{path} is a folder", "name a file in it")
+            else:
+                yield from _of_folder(setting, path.parent)
+    if config.map.directory:
+        yield from _of_folder("map.directory", Path(config.map.directory))
+
+
+def _of_folder(setting: str, folder: Path) -> Iterable[Check]:
+    there = _there_of(folder)
+    if not there.is_dir():
+        yield Check(setting, "failure", f"{there} is no folder", f"make {folder} one")
+    elif not os.access(there, os.W_OK | os.X_OK):
+        who = "whoever runs this check"
+        yield Check(setting, "warning", f"{who} cannot write in {there}", "can the service?")
+
+
+def _there_of(path: Path) -> Path:
+    """Return the path, or the nearest above it that is there."""
+    while not path.exists() and path != path.parent:
+        path = path.parent
+    return path
 
 
 def _of_calibration(options: CameraOptions) -> Check:

@@ -35,6 +35,8 @@ _NOT_SHARED = (1 << 64) - 1
 _MOST_MEMORIES = 64
 _END_S = 2.0
 _LOOK_S = 0.01
+END_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+"""What asks a service to end; the last: the terminal that it was started from is gone."""
 
 
 class ProcessLostError(Exception):
@@ -178,7 +180,7 @@ def _serve(connection: socket.socket, target: object, lanes: Mapping[str, int]) 
 def _leave_parent(keep: int) -> None:
     """Let go of what is the parent's: its signals, and its files and sockets but one."""
     signal.set_wakeup_fd(-1)
-    for end in (signal.SIGINT, signal.SIGTERM):
+    for end in END_SIGNALS:
         signal.signal(end, signal.SIG_IGN)
     for name in os.listdir("/dev/fd"):
         number = int(name)

@@ -23,6 +23,7 @@ from vcl_companion.errors import WireError
 from vcl_companion.localization.filter_state import FilterState
 from vcl_companion.localization.inter import NoProposal, Proposal
 from vcl_companion.localization.map_index import MapIndex
+from vcl_companion.swarm.pose_requests import MOST_REQUEST_BYTES
 from vcl_companion.vision.features import Detector
 from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.pose_messages import (
@@ -40,7 +41,7 @@ _SETTLE_S = 0.5
 # and no more than half of the time goes by with them. Who asks sooner is answered later.
 _EVERY_S = 0.5
 # Of a request's image. A swarm whose map has larger frames has cameras for it.
-_MOST_BYTES, _MOST_PX = 1 << 18, 1 << 21
+_MOST_PX = 1 << 21
 # The map may have to be indexed by our detector first, behind an update that is being built.
 _INDEX_WAIT_S = 3.0
 
@@ -192,8 +193,8 @@ def _too_large(asked: FrameAnswer, stored: StoredMap) -> str:
     most_px = max(_MOST_PX, *(camera.width_px * camera.height_px for camera in cameras))
     if n_px > most_px:
         return f"a frame of {n_px} pixels, at most {most_px}"
-    if len(asked.image_bytes) > _MOST_BYTES:
-        return f"an image of {len(asked.image_bytes)} bytes, at most {_MOST_BYTES}"
+    if len(asked.image_bytes) > MOST_REQUEST_BYTES:
+        return f"an image of {len(asked.image_bytes)} bytes, at most {MOST_REQUEST_BYTES}"
     return ""
 
 

@@ -148,7 +148,7 @@ def _ardupilot(*, sends_velocity: bool) -> tuple[Rule, ...]:
             "our poses tell no quality, and would all be too bad", may_lack=True,
         ),
         Rule(
-            ("VISO_POS_M_NSE",), "warns", _at_most(0.1), 0.05,
+            ("VISO_POS_M_NSE",), "warns", _at_most(0.05), 0.05,
             "it takes our poses for worse than they are",
         ),
         Rule(

@@ -69,7 +69,7 @@ def read_passphrase(path: Path) -> str:
                     f"{stat.S_IMODE(about.st_mode):03o}); run `chmod 600 {path}`, and make a new "
                     "key if somebody may have read it"
                 )
-            text = file.read(_MAX_FILE_BYTES + 1).decode("ascii", errors="replace").strip()
+            text = _text_of(file.read(_MAX_FILE_BYTES + 1))
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: {_why(error)}") from error
     if not _PASSPHRASE.fullmatch(text):
@@ -125,13 +125,12 @@ def _check_may_go(target: Path) -> None:
     try:
         with open(target, "rb", opener=at_once) as file:
             is_file = stat.S_ISREG(os.fstat(file.fileno()).st_mode)
-            text = file.read(_MAX_FILE_BYTES + 1) if is_file else b""
+            text = _text_of(file.read(_MAX_FILE_BYTES + 1)) if is_file else ""
     except FileNotFoundError:
         return
     except (OSError, ValueError) as error:
         raise ConfigError(f"{target}: cannot be installed ({_why(error)})") from error
-    text = text.strip()
-    if not is_file or (text and not _PASSPHRASE.fullmatch(text.decode("ascii", errors="replace"))):
+    if not is_file or (text and not _PASSPHRASE.fullmatch(text)):
         raise ConfigError(f"{target}: is there, and is no key file; remove it, or name another one")
 
 
@@ -147,6 +146,11 @@ def _write(path: Path, passphrase: str, mode: int) -> None:
     except OSError:  # a full disk: what is left is no key, and would keep one from being made
         path.unlink(missing_ok=True)
         raise
+
+
+def _text_of(data: bytes) -> str:
+    """Return what a file says, without the mark that some editors begin a text with."""
+    return data.decode("utf-8-sig", errors="replace").strip()
 
 
 def _key_of(passphrase: str) -> SigningKey:

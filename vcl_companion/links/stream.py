@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import os
 import socket
 import termios
@@ -133,7 +134,16 @@ class SerialTransport(StreamTransport):
 
     async def _open(self) -> _Device:
         # timeout 0 leaves the descriptor in pyserial's O_NONBLOCK mode with VMIN 0.
-        return serial.Serial(self._device, self._baud, timeout=0, write_timeout=0, exclusive=True)
+        try:
+            return serial.Serial(
+                self._device, self._baud, timeout=0, write_timeout=0, exclusive=True
+            )
+        except serial.SerialException as error:
+            if error.errno == errno.EAGAIN:
+                raise OSError("another program has it open") from error
+            if error.errno:  # its own text names the device once more
+                raise OSError(os.strerror(error.errno)) from error
+            raise
 
 
 class TcpTransport(StreamTransport):

@@ -74,7 +74,9 @@ def parse_link(link: str) -> LinkAddress:
         return LinkAddress(cast(LinkKind, kind), host, port)
     device, _, baud = rest.rpartition(":")
     if not device.startswith("/"):
-        raise ConfigError(f"link {link!r}: expected serial:DEVICE:BAUD with the device's full path")
+        raise ConfigError(
+            f"link {link!r}: expected serial:DEVICE:BAUD, as in serial:/dev/serial0:921600"
+        )
     speed = _bounded_int(baud, _MAX_BAUD, "baud", f"link {link!r}")
     if speed == 0:
         raise ConfigError(f"link {link!r}: baud must be above 0")
@@ -142,6 +144,13 @@ def parse_peers(listen: str, to: Sequence[str]) -> tuple[Address, tuple[Address,
             alone, or its port is not the one listened at.
     """
     listen_address = _numeric(listen, "listen")
+    if ipaddress.ip_address(listen_address[0]).is_multicast:
+        raise ConfigError(
+            f"listen: {listen_address[0]} is a multicast group, which goes into `to`; here goes "
+            "the address of the interface to join it on"
+        )
+    if to and listen_address[1] == 0:
+        raise ConfigError(f"listen: {listen} needs a port above 0, which the others send to")
     destinations = tuple(_numeric(text, "to") for text in to)
     if len(destinations) > _MAX_PEERS:
         raise ConfigError(f"to: at most {_MAX_PEERS} addresses, got {len(destinations)}")
@@ -150,7 +159,7 @@ def parse_peers(listen: str, to: Sequence[str]) -> tuple[Address, tuple[Address,
             raise ConfigError(f"to: {text} is there twice")
     for host, port in destinations:
         if port == 0:
-            raise ConfigError(f"to: {host} needs a port")
+            raise ConfigError(f"to: {host} needs a port above 0")
         alone = len(destinations) == 1 and port == listen_address[1]
         if ipaddress.ip_address(host).is_multicast and not alone:
             raise ConfigError(f"to: a multicast group ({host}) stands alone, with listen's port")
@@ -168,11 +177,12 @@ def open_peer_socket(
 
 
 def _numeric(text: str, what: str) -> Address:
-    host, port = _split_host_port(text, what)
+    host, _, port = text.rpartition(":")
     try:
-        return str(ipaddress.IPv4Address(host)), port
+        address = str(ipaddress.IPv4Address(host))
     except ValueError as error:
-        raise ConfigError(f"{what}: {error} (a numeric IPv4 address is needed here)") from error
+        raise ConfigError(f"{what}: expected a numeric IPv4 ADDRESS:PORT, got {text!r}") from error
+    return address, _bounded_int(port, 65535, "port", what)
 
 
 def _split_host_port(text: str, what: str) -> Address:

@@ -10,6 +10,9 @@ from vcl_companion.options import require_positive
 from vcl_companion.swarm.group import Group
 from vcl_companion.vision.features import Detector
 
+MOST_REQUEST_BYTES = 1 << 18
+"""No host looks at a longer image."""
+
 
 @dataclass(frozen=True)
 class InterMavOptions(InterOptions):
@@ -55,8 +58,10 @@ class InterMavOptions(InterOptions):
             raise ValueError(f"max_hosts must lie in 1..16, got {self.max_hosts}")
         if not 1 <= self.request_quality <= 100:
             raise ValueError(f"request_quality must lie in 1..100, got {self.request_quality}")
-        if self.request_bytes < 1000:
-            raise ValueError(f"request_bytes must be 1000 or more, got {self.request_bytes}")
+        if not 1000 <= self.request_bytes <= MOST_REQUEST_BYTES:
+            raise ValueError(
+                f"request_bytes must lie in 1000..{MOST_REQUEST_BYTES}, got {self.request_bytes}"
+            )
 
 
 # What peers knew so long ago tells no more whether they know better than we do.

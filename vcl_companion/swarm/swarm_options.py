@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from vcl_companion.errors import ConfigError
 
+# Drones show themselves every second.
+_LEAST_TIMEOUT_S = 2.0
 _MAX_MEMBER_ID = 250
 
 
@@ -46,9 +48,11 @@ class SwarmOptions:
             raise ConfigError(f"members: {list(self.members)} names a drone twice")
         if self.leader and self.leader not in self.members:
             raise ConfigError(f"leader: {self.leader} is not one of members {list(self.members)}")
-        for name in ("heartbeat_timeout_s", "leader_wait_s"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ConfigError(f"{name}: {getattr(self, name)} is not positive")
+        timeout_s = self.heartbeat_timeout_s
+        if not (math.isfinite(timeout_s) and timeout_s >= _LEAST_TIMEOUT_S):
+            raise ConfigError(f"heartbeat_timeout_s: {timeout_s}, and at least {_LEAST_TIMEOUT_S}")
+        if not (math.isfinite(self.leader_wait_s) and self.leader_wait_s > 0):
+            raise ConfigError(f"leader_wait_s: {self.leader_wait_s} is not positive")
         for name in ("split_after_s", "rejoin_after_s"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ConfigError(f"{name}: {getattr(self, name)} is negative or not finite")
