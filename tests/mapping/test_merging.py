@@ -396,6 +396,24 @@ def test_the_same_thing_seen_in_two_places_is_no_place() -> None:
     assert "explain the landmarks alike" in reason(found)
 
 
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_a_map_stays_where_more_than_its_observations_has_put_it(seed: int) -> None:
+    """Keyframes that are gone have made it: by what is left alone it would move by centimetres."""
+    given = two(seed)
+    rng = np.random.default_rng(seed)
+    left = given.senior.observed_px + rng.normal(0.0, 0.5, given.senior.observed_px.shape)
+    noise_px = float(np.hypot(given.senior.pixel_noise_px, 0.5))
+    known = replace(given.senior, observed_px=left, pixel_noise_px=noise_px)
+    found = replace(given, senior=known).merged()
+    as_it_was = given.merged()
+    assert isinstance(found, LandmarkMap), found
+    assert isinstance(as_it_was, LandmarkMap), as_it_was
+    for one, other in zip(found.keyframes[:3], as_it_was.keyframes[:3], strict=True):
+        assert one.image_bytes == other.image_bytes
+        apart = one.world_from_body.translation - other.world_from_body.translation
+        assert np.linalg.norm(apart) < 0.003
+
+
 def test_a_map_out_of_shape_does_not_bend_ours() -> None:
     given = two(12)
     y = given.junior.points_world @ given.junior.keyframes[0].world_from_body.rotation[:, 1]

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vcl_companion.geometry.rotation import Array
 from vcl_companion.geometry.similarity import Similarity
 from vcl_companion.mapping.agreement import contradiction
 from vcl_companion.mapping.aligning import MIN_COMMON, Aligned, Side, aligned
@@ -34,7 +35,14 @@ from vcl_companion.mapping.thinning import spread
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
 from vcl_companion.mapping.union import Union, united
-from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust
+from vcl_companion.vision.bundle import (
+    BundleOptions,
+    Distance,
+    Views,
+    adjust,
+    reprojection_residuals,
+    residual_noise_px,
+)
 from vcl_companion.vision.features import Detector
 
 # So many landmarks of both tell how two maps of one world stand, whatever else there is.
@@ -237,7 +245,10 @@ def _adjusted(both: Union, senior: Side, junior: Side, options: MapOptions) -> t
             Distance(d.keyframe_a, d.keyframe_b, d.distance_m, d.sigma_m) for d in both.distances
         ),
     )
-    views, fits, good, noise_px = _settled(views, _noise_px(senior, junior, options), options)
+    settled = both.settled[rows]
+    settled = np.where(np.isfinite(settled), settled, ideal)
+    noise_px = _noise_px(senior, junior, options)
+    views, fits, good, noise_px = _settled(views, settled, noise_px, options)
     columns = _tied(fits & good[:, None], len(senior.map.keyframes))
     observed = np.where(fits[..., None], observed, np.nan)[:, columns]
     good &= np.isfinite(observed[..., 0]).sum(axis=1) >= 2
@@ -284,23 +295,34 @@ def _noise_px(senior: Side, junior: Side, options: MapOptions) -> float:
     return max(senior.map.pixel_noise_px, min(junior.map.pixel_noise_px, most))
 
 
-def _settled(views: Views, noise_px: float, options: MapOptions) -> tuple[Views, Mask, Mask, float]:
-    """Adjust with ever narrower limits; return also what fits, and the noise of that."""
-    ideal, limit_px = views.ideal, max(_LIMIT_PX, _MAX_SIGMAS * noise_px)
+def _settled(
+    views: Views, settled: Array, noise_px: float, options: MapOptions
+) -> tuple[Views, Mask, Mask, float]:
+    """Adjust with ever narrower limits; return also what fits, and the noise of that.
+
+    Args:
+        views: both maps; what fits is judged by its observations.
+        settled: (N, V, 2) what is adjusted by (``union``).
+        noise_px: of the observations.
+        options: of the map.
+    """
+    limit_px = max(_LIMIT_PX, _MAX_SIGMAS * noise_px)
     good = np.ones(len(views.points), dtype=bool)
     for factor, steps in _TURNS:
         # What missed by the poses of one turn may fit by those of the next.
-        fits, again = fitting(replace(views, ideal=ideal), factor * limit_px, options)
+        fits, again = fitting(views, factor * limit_px, options)
         good &= again
-        views = replace(views, ideal=np.where(fits[..., None], ideal, np.nan))
-        good[np.flatnonzero(good)[decisive(_of(views, good))]] = False
+        used = replace(views, ideal=np.where(fits[..., None], settled, np.nan))
+        good[np.flatnonzero(good)[decisive(_of(used, good))]] = False
         cauchy_px = max(_LIMIT_PX, 3.0 * noise_px)
-        adjusted, found_px = adjust(_of(views, good), BundleOptions(steps, cauchy_px))
+        adjusted, _ = adjust(_of(used, good), BundleOptions(steps, cauchy_px))
         points = views.points.copy()
         points[good] = adjusted.points
         views = replace(views, bodies=adjusted.bodies, points=points)
     fits, again = fitting(views, limit_px, options)
-    return views, fits, good & again, found_px
+    good &= again
+    seen = replace(views, ideal=np.where(fits[..., None], views.ideal, np.nan))
+    return views, fits, good, residual_noise_px(reprojection_residuals(_of(seen, good)))
 
 
 def _of(views: Views, good: Mask) -> Views:

@@ -1,36 +1,48 @@
 """Two maps in one table: keyframes of both, and landmarks that are the same only once (IV-G).
 
 Patches of the one's landmarks are looked for in the other's keyframes, from where these are
-known to be by then: that ties the maps together by hundredths of a pixel, and shows which
-landmarks of the other are one of ours.
+known to be by then: that ties the maps together by hundredths of a pixel. United are landmarks
+that both have from an image of both; those that are only alike by their descriptors where there are
+neither.
+
+A map's estimate knows more than the observations that it still has: those of keyframes that were
+dropped have made it. Adjusted by what is left alone it would move by as much as is not known any
+more. So each map's own observations are taken where its own estimate puts them: by themselves
+they leave it where it is, as surely as they ever held it, and what is new moves it by as much as
+it should.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.aligning import Aligned, Side
+from vcl_companion.mapping.aligning import MIN_COMMON, Aligned, Side
 from vcl_companion.mapping.common_landmarks import shared_keyframes
 from vcl_companion.mapping.culling import Mask, depth_errors
 from vcl_companion.mapping.growth import view_of
 from vcl_companion.mapping.known_features import Index
-from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance
+from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
 from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.patch_table import PatchTable, PyramidOf, pyramids_of
 from vcl_companion.mapping.placing import place
+from vcl_companion.mapping.registration import MIN_SEEN
 from vcl_companion.mapping.uncertainty import views_of
-from vcl_companion.vision.information import squared_distances
+from vcl_companion.vision.bundle import reprojection_residuals, residual_noise_px
 from vcl_companion.vision.resection import NotFound
 
-# What lies so near to a landmark's patch is that landmark.
-_SAME_PX = 0.75
-# ... if its depth does not say otherwise: 99.9 % of a three-dimensional Gaussian.
-_CHI2_3_999 = 16.3
+# In an image of both maps a landmark of both lies where it did when they parted.
+_SAME_PX = 0.05
+# Keyframes of the other map that show so many patches each tie it to the one, its scale too.
+_LEAST_TIED = 2
+# An observation further from where its map puts it is none of those that it was made of.
+_SETTLED_PX, _SETTLED_SIGMAS = 0.5, 4.0
+# An estimate that is made of its observations, and of more, misses them by no more than so many
+# times the noise that it is said to have: two of one landmark, held by others, by twice as much as
+# if they alone placed it. Maps in flight miss by 0.8 to 1.1 times.
+_MADE_OF = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +53,8 @@ class Union:
         keyframes: the senior's, then those that only the junior has.
         points: (N, 3) the senior's landmarks, then those that only the junior has, m.
         observed: (N, V, 2) px, NaN where not seen.
+        settled: (N, V, 2) ideal image coordinates of a map's own observations by its own estimate;
+            NaN where not seen, and of what was found only now.
         distances: of both; of the senior only where both are of one world and so are these.
         row: (N_junior,) which landmark each of the junior's is here.
     """
@@ -48,6 +62,7 @@ class Union:
     keyframes: tuple[Keyframe, ...]
     points: Array
     observed: Array
+    settled: Array
     distances: tuple[KnownDistance, ...]
     row: Index
 
@@ -84,19 +99,59 @@ def united(
         )
         for i in new
     )
-    row = np.full(len(junior.map.points_world), -1, dtype=np.intp)
-    row[stands.common.junior] = stands.common.senior
-    observed = np.full((len(senior.map.points_world), n_old + len(new), 2), np.nan)
-    observed[:, :n_old] = senior.map.observed_px
+    seen = np.full((len(senior.map.points_world), n_old + len(new), 4), np.nan)
+    seen[:, :n_old] = _seen_and_settled(senior.map)
     if options.patches:
-        observed[:, n_old:] = _shown(senior, brought, pyramid_of, options)
-        there = junior.map.observed_px[:, new]
-        _recognised(row, observed[:, n_old:], there, _explains(senior, junior, stands))
-    observed, points, row = _with_junior(observed, senior, junior, stands, column, row)
+        seen[:, n_old:, :2] = _shown(senior, brought, pyramid_of, options)
+    row = np.full(len(junior.map.points_world), -1, dtype=np.intp)
+    same = _are_same(senior, junior, stands)
+    if same.sum() < MIN_COMMON and not _are_tied(seen, n_old):
+        same[:] = True
+    row[stands.common.junior[same]] = stands.common.senior[same]
+    seen, points, row = _with_junior(seen, senior, junior, stands, column, row)
     distances = senior.map.distances
     if not one_world:
         distances += _brought_distances(senior, junior, column, options)
-    return Union(senior.map.keyframes + brought, points, observed, distances, row)
+    keyframes = senior.map.keyframes + brought
+    return Union(keyframes, points, seen[..., :2], seen[..., 2:], distances, row)
+
+
+def _are_same(senior: Side, junior: Side, stands: Aligned) -> Mask:
+    """Return (M,) which pairs of landmarks were one before the maps parted.
+
+    Others that are alike, by their descriptors or by lying near to each other, lie some tenths of a
+    pixel beside, all to one side: united they bend both maps.
+    """
+    one, other = stands.common.senior, stands.common.junior
+    same = np.zeros(len(one), dtype=bool)
+    for k, i in shared_keyframes(senior.map, junior.map):
+        apart = senior.map.observed_px[one, k] - junior.map.observed_px[other, i]
+        same |= np.linalg.norm(apart, axis=1) < _SAME_PX
+    return same
+
+
+def _are_tied(seen: Array, n_old: int) -> bool:
+    """Whether patches of the one map that the other's keyframes show hold both together."""
+    shown = np.isfinite(seen[:, n_old:, 0]).sum(axis=0)
+    return int((shown >= MIN_SEEN).sum()) >= _LEAST_TIED
+
+
+def _seen_and_settled(landmark_map: LandmarkMap) -> Array:
+    """Return (N, V, 4) a map's observations, px, and where its estimate puts them, ideal.
+
+    NaN where its estimate puts them elsewhere, and everywhere where most are elsewhere: that is
+    not made of them, and they may put it right.
+    """
+    views = views_of(landmark_map)
+    residuals = reprojection_residuals(views)
+    noise_px = landmark_map.pixel_noise_px
+    settled = np.full(landmark_map.observed_px.shape, np.nan)
+    if residual_noise_px(residuals) < _MADE_OF * noise_px:
+        most_px = max(_SETTLED_PX, _SETTLED_SIGMAS * noise_px)
+        here = np.linalg.norm(residuals, axis=2) < most_px
+        away = np.linalg.solve(views.slopes[here], residuals[here][..., None])[..., 0]
+        settled[here] = views.ideal[here] + away
+    return np.concatenate([landmark_map.observed_px, settled], axis=2)
 
 
 def _brought_distances(
@@ -147,52 +202,12 @@ def _shown(
     return out
 
 
-def _explains(senior: Side, junior: Side, stands: Aligned) -> Callable[[Index, Index], Mask]:
-    """Return what says whether pairs of landmarks are one by where they are."""
-    at = stands.senior_from_junior
-    turn = at.scale * at.rotation
-    of_a, of_b = senior.sure.marginal(), junior.sure.marginal()
-
-    def explained(one: Index, other: Index) -> Mask:
-        apart = senior.map.points_world[one] - at.apply(junior.map.points_world[other])
-        covariance = of_a[one] + turn @ of_b[other] @ turn.T
-        return squared_distances(apart, covariance) < _CHI2_3_999
-
-    return explained
-
-
-def _recognised(
-    row: Index, found: Array, there: Array, explains: Callable[[Index, Index], Mask]
-) -> None:
-    """Unite landmarks of the junior that lie where its keyframes show one of the senior's.
-
-    Args:
-        row: (N_junior,) the senior's landmark that each is, -1 for none; is completed.
-        found: (N, K, 2) where the junior's keyframes show the senior's.
-        there: (N_junior, K, 2) and where they show its own.
-        explains: whether they are one by where they are.
-    """
-    for i in range(found.shape[1]):
-        here = np.flatnonzero(np.isfinite(found[:, i, 0]))
-        own = np.flatnonzero(np.isfinite(there[:, i, 0]) & (row < 0))
-        here = here[~np.isin(here, row)]
-        if len(here) == 0 or len(own) == 0:
-            continue
-        away_px, nearest = cKDTree(found[here, i]).query(there[own, i])
-        distance = np.asarray(away_px, dtype=np.float64)
-        one = here[np.asarray(nearest, dtype=np.intp)]
-        same = (distance < _SAME_PX) & explains(one, own)
-        order = np.flatnonzero(same)[np.argsort(distance[same], kind="stable")]
-        order = order[np.sort(np.unique(one[order], return_index=True)[1])]
-        row[own[order]] = one[order]
-
-
 def _with_junior(
     observed: Array, senior: Side, junior: Side, stands: Aligned, column: Index, row: Index
 ) -> tuple[Array, Array, Index]:
     """Add what the junior saw: to landmarks of both where it is not known yet, and its own."""
-    n, seen = len(observed), np.full((len(row), observed.shape[1], 2), np.nan)
-    seen[:, column] = junior.map.observed_px
+    n, seen = len(observed), np.full((len(row), *observed.shape[1:]), np.nan)
+    seen[:, column] = _seen_and_settled(junior.map)
     both = np.flatnonzero(row >= 0)
     known = observed[row[both]]
     # Found by the same patch in several of its keyframes, its own pixels would say it again.
