@@ -100,7 +100,7 @@ def united(
         for i in new
     )
     seen = np.full((len(senior.map.points_world), n_old + len(new), 4), np.nan)
-    seen[:, :n_old] = _seen_and_settled(senior.map)
+    seen[:, :n_old] = _seen_and_settled(senior.map, options)
     if options.patches:
         seen[:, n_old:, :2] = _shown(senior, brought, pyramid_of, options)
     row = np.full(len(junior.map.points_world), -1, dtype=np.intp)
@@ -108,7 +108,9 @@ def united(
     if same.sum() < MIN_COMMON and not _are_tied(seen, n_old):
         same[:] = True
     row[stands.common.junior[same]] = stands.common.senior[same]
-    seen, points, row = _with_junior(seen, senior, junior, stands, column, row)
+    there = np.full((len(row), *seen.shape[1:]), np.nan)
+    there[:, column] = _seen_and_settled(junior.map, options)
+    seen, points, row = _with_junior(seen, there, senior, junior, stands, row)
     distances = senior.map.distances
     if not one_world:
         distances += _brought_distances(senior, junior, column, options)
@@ -136,7 +138,7 @@ def _are_tied(seen: Array, n_old: int) -> bool:
     return int((shown >= MIN_SEEN).sum()) >= _LEAST_TIED
 
 
-def _seen_and_settled(landmark_map: LandmarkMap) -> Array:
+def _seen_and_settled(landmark_map: LandmarkMap, options: MapOptions) -> Array:
     """Return (N, V, 4) a map's observations, px, and where its estimate puts them, ideal.
 
     NaN where its estimate puts them elsewhere, and everywhere where most are elsewhere: that is
@@ -144,7 +146,8 @@ def _seen_and_settled(landmark_map: LandmarkMap) -> Array:
     """
     views = views_of(landmark_map)
     residuals = reprojection_residuals(views)
-    noise_px = landmark_map.pixel_noise_px
+    # A map's word on its noise counts as far as observations may miss at all.
+    noise_px = min(landmark_map.pixel_noise_px, options.max_error_px / _SETTLED_SIGMAS)
     settled = np.full(landmark_map.observed_px.shape, np.nan)
     if residual_noise_px(residuals) < _MADE_OF * noise_px:
         most_px = max(_SETTLED_PX, _SETTLED_SIGMAS * noise_px)
@@ -203,24 +206,35 @@ def _shown(
 
 
 def _with_junior(
-    observed: Array, senior: Side, junior: Side, stands: Aligned, column: Index, row: Index
+    observed: Array, there: Array, senior: Side, junior: Side, stands: Aligned, row: Index
 ) -> tuple[Array, Array, Index]:
-    """Add what the junior saw: to landmarks of both where it is not known yet, and its own."""
-    n, seen = len(observed), np.full((len(row), *observed.shape[1:]), np.nan)
-    seen[:, column] = _seen_and_settled(junior.map)
+    """Add what the junior saw: to landmarks of both where it is not known yet, and its own.
+
+    Args:
+        observed: (N_senior, V, 4) the senior's landmarks in all keyframes (``_seen_and_settled``).
+        there: (N_junior, V, 4) the same of the junior's.
+        senior: the one map.
+        junior: the other.
+        stands: how that stands in the one.
+        row: (N_junior,) the senior's landmark that each of the junior's is, -1 for none.
+
+    Returns:
+        What all landmarks are seen as, where they are, and which of them each of the junior's is.
+    """
+    n = len(observed)
     both = np.flatnonzero(row >= 0)
     known = observed[row[both]]
     # Found by the same patch in several of its keyframes, its own pixels would say it again.
     lacking = ~np.isfinite(known[..., :1])
     own = np.isfinite(known[:, len(senior.map.keyframes) :, 0]).sum(axis=1) >= 2
     lacking[own, len(senior.map.keyframes) :] = False
-    observed[row[both]] = np.where(lacking, seen[both], known)
+    observed[row[both]] = np.where(lacking, there[both], known)
     fresh = np.flatnonzero(row < 0)
     row = row.copy()
     row[fresh] = n + np.arange(len(fresh))
     points = stands.senior_from_junior.apply(junior.map.points_world[fresh])
     return (
-        np.concatenate([observed, seen[fresh]]),
+        np.concatenate([observed, there[fresh]]),
         np.concatenate([senior.map.points_world, points]),
         row,
     )

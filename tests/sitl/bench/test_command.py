@@ -61,7 +61,7 @@ def test_three_daemons_in_real_time_are_told_of_each(tmp_path: Path) -> None:
         assert found["frames"] == 23
         # The report's shares have six decimals.
         assert 90.0 < found["localized"] + found["dropped"] <= 100.0 + 1e-4
-        assert 0.0 < found["capture to wire, p50"] <= found["capture to wire, p99"]
+        assert 0.0 < found["arrival to wire, p50"] <= found["arrival to wire, p99"]
         # The daemon's own, not the harness's, which holds the rendered town.
         assert 100.0 < found["resident, most"] < 400.0
         assert 0.0 < found["share of a core"] < 300.0

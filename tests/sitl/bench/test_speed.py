@@ -154,5 +154,5 @@ def test_a_daemon_is_judged_by_what_its_report_says() -> None:
     assert (figures["dropped"].value, figures["dropped"].met) == (1.5, False)
     assert (figures["localized"].value, figures["localized"].met) == (98.0, False)
     assert figures["resident, most"].met
-    assert figures["capture to wire, p99"].met is False
+    assert figures["arrival to wire, p99"].met is False
     assert figures["share of a core"].value == pytest.approx(40.0)
