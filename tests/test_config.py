@@ -95,7 +95,7 @@ def test_a_mistyped_value_names_path_expected_and_got(table: dict[str, Any], mes
         ("[camera]\nrate_hz = true", "camera.rate_hz: expected a number, got true"),
         (
             "[camera]\nrate_hz = nan",
-            "camera.rate_hz: expected a finite number up to 10000, got",
+            "camera.rate_hz: expected a finite number up to 10000, got nan",
         ),
         ("[camera]\nrate_hz = -1.5", "[camera] rate_hz: must be in 0..240, got -1.5"),
         ('[camera]\nsource = "usb:0"', "[camera] source: expected one of v4l2:DEVICE"),

@@ -88,7 +88,8 @@ def united(
     """
     n_old, at = len(senior.map.keyframes), stands.senior_from_junior
     column = np.full(len(junior.map.keyframes), -1, dtype=np.intp)
-    for k, i in shared_keyframes(senior.map, junior.map):
+    shared = shared_keyframes(senior.map, junior.map)
+    for k, i in shared:
         column[i] = k
     new = np.flatnonzero(column < 0)
     column[new] = n_old + np.arange(len(new))
@@ -104,7 +105,7 @@ def united(
     if options.patches:
         seen[:, n_old:, :2] = _shown(senior, brought, pyramid_of, options)
     row = np.full(len(junior.map.points_world), -1, dtype=np.intp)
-    same = _are_same(senior, junior, stands)
+    same = _are_same(senior, junior, stands, shared)
     if same.sum() < MIN_COMMON and not _are_tied(seen, n_old):
         same[:] = True
     row[stands.common.junior[same]] = stands.common.senior[same]
@@ -118,7 +119,7 @@ def united(
     return Union(keyframes, points, seen[..., :2], seen[..., 2:], distances, row)
 
 
-def _are_same(senior: Side, junior: Side, stands: Aligned) -> Mask:
+def _are_same(senior: Side, junior: Side, stands: Aligned, shared: list[tuple[int, int]]) -> Mask:
     """Return (M,) which pairs of landmarks were one before the maps parted.
 
     Others that are alike, by their descriptors or by lying near to each other, lie some tenths of a
@@ -126,7 +127,7 @@ def _are_same(senior: Side, junior: Side, stands: Aligned) -> Mask:
     """
     one, other = stands.common.senior, stands.common.junior
     same = np.zeros(len(one), dtype=bool)
-    for k, i in shared_keyframes(senior.map, junior.map):
+    for k, i in shared:
         apart = senior.map.observed_px[one, k] - junior.map.observed_px[other, i]
         same |= np.linalg.norm(apart, axis=1) < _SAME_PX
     return same

@@ -21,7 +21,8 @@ _MAX_NS = 2**63 - 1
 _MAX_SECONDS = 2**33  # of nanoseconds that fit 63 bits, the nearest power of two below
 # Far beyond any flight, and far from where differences of floats overflow.
 _MAX_VALUE = 1e9
-_MOST_BYTES = 1 << 30  # of a table of any flight
+MOST_BYTES = 1 << 30
+"""Longest table of any flight."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ def read_rows(path: Path, advice: str, separator: str | None = ",") -> list[Row]
         RecordingError: absent, not text, or without any row.
     """
     try:
-        text = read_text(path, _MOST_BYTES)
+        text = read_text(path, MOST_BYTES)
     except FileNotFoundError:
         raise RecordingError(f"{path}: missing; {advice}") from None
     except OSError as error:

@@ -13,12 +13,11 @@ import numpy as np
 
 from vcl_companion.errors import RecordingError
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.recording.tables import split_rows
+from vcl_companion.recording.tables import MOST_BYTES, split_rows
 from vcl_companion.recording.trajectory import QUATERNION_TOLERANCE
 from vcl_companion.text_file import read_text
 
 _NS_PER_S = 1_000_000_000
-_MOST_BYTES = 1 << 30  # of a table of any flight
 
 
 def tum_line(at_ns: int, pose: Pose) -> str:
@@ -47,7 +46,7 @@ def read_tum(path: Path) -> list[tuple[int, Pose]]:
         RecordingError: a row is malformed; one line that names it.
     """
     try:
-        text = read_text(path, _MOST_BYTES)
+        text = read_text(path, MOST_BYTES)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
     except ValueError:
