@@ -107,6 +107,28 @@ def test_one_drone_alone_extends_the_map_from_where_it_believes_to_be(
     assert after.n_visible > before.n_visible
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_map_stays_where_more_than_its_observations_has_put_it(
+    views: list[DroneView], seed: int
+) -> None:
+    """Keyframes that are gone have made it: by what is left alone it would move by centimetres."""
+    old = extend_map(first_map(views), PARENT, views[2:3], OPTIONS)
+    assert isinstance(old, LandmarkMap), old
+    rng = np.random.default_rng(seed)
+    left = old.observed_px + rng.normal(0.0, 0.4, old.observed_px.shape)
+    known = replace(old, observed_px=left, pixel_noise_px=float(np.hypot(old.pixel_noise_px, 0.4)))
+    new = [replace(views[3], features=(), world_from_body=BODIES[3])]
+    found = extend_map(known, PARENT, new, OPTIONS)
+    as_it_was = extend_map(old, PARENT, new, OPTIONS)
+    assert isinstance(found, LandmarkMap), found
+    assert isinstance(as_it_was, LandmarkMap), as_it_was
+    assert len(found.points_world) > 0.9 * len(as_it_was.points_world)
+    assert found.pixel_noise_px > 2.0 * as_it_was.pixel_noise_px
+    for one, other in zip(found.keyframes[:3], as_it_was.keyframes[:3], strict=True):
+        apart = one.world_from_body.translation - other.world_from_body.translation
+        assert np.linalg.norm(apart) < 0.005
+
+
 @pytest.mark.parametrize("wrong", [at(0.0, 0.0, 0.0, 60.0), at(3.0, 9.0), at(500.0, 0.0)])
 def test_a_wrong_guess_is_found_out(views: list[DroneView], wrong: Pose) -> None:
     old = first_map(views)

@@ -64,12 +64,17 @@ def fitting(views: Views, limit_px: float, options: MapOptions) -> tuple[Mask, M
     cams = [body @ mounting for body, mounting in zip(views.bodies, views.mountings, strict=True)]
     angle = ray_angles(cams, np.nan_to_num(views.points), fits)
     good = (fits.sum(axis=1) >= 2) & (angle > np.deg2rad(options.min_angle_deg))
-    kept = np.where(fits[good][..., None], views.ideal[good], np.nan)
-    vague = depth_errors(
-        replace(views, ideal=kept, points=views.points[good], slopes=views.slopes[good])
-    )
+    kept = of_landmarks(views, good)
+    vague = depth_errors(replace(kept, ideal=np.where(fits[good][..., None], kept.ideal, np.nan)))
     good[np.flatnonzero(good)[vague > 2.0 * options.max_depth_error]] = False
     return np.asarray(fits), np.asarray(good)
+
+
+def of_landmarks(views: Views, good: Mask) -> Views:
+    """Return the same views of fewer landmarks: the (N,) good ones."""
+    return replace(
+        views, slopes=views.slopes[good], ideal=views.ideal[good], points=views.points[good]
+    )
 
 
 def depth_errors(views: Views) -> Array:

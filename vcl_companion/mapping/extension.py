@@ -42,6 +42,7 @@ from vcl_companion.mapping.patch_table import (
 )
 from vcl_companion.mapping.placing import Placed, place, references
 from vcl_companion.mapping.registration import MIN_SEEN
+from vcl_companion.mapping.settling import noise_of, settled
 from vcl_companion.mapping.sharpening import SETTLED_CAUCHY_PX
 from vcl_companion.mapping.thinning import spread
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
@@ -121,6 +122,7 @@ class Extension:
         self._mountings = tuple(v.body_from_cam for v in shown_by)
         self._table = PatchTable(self._cameras, pyramids_of(self._images, pyramid_of))
         self._relative = depth_errors(views_of(old))
+        self._settled = settled(old, options)
         self.reasons: dict[int, str] = {}
 
     def run(self) -> Growth | None:
@@ -257,14 +259,17 @@ class Extension:
             views = replace(views, points=points)
         limit_px = max(_LIMIT_PX[turn], _MAX_SIGMAS * self._old.pixel_noise_px)
         fits, good = fitting(views, 2.0 * limit_px, self._options)
-        views = replace(views, ideal=np.where(fits[..., None], ideal, np.nan))
-        views, noise_px = _adjusted_near(
-            views,
+        used = np.where(fits[..., None], self._with_settled(ideal), np.nan)
+        adjusted = _adjusted_near(
+            replace(views, ideal=used),
             table.noise,
             good,
             self._n_keys,
             BundleOptions(_STEPS[turn], _CAUCHY_PX[turn], _LEAST_GAIN[turn]),
         )
+        # What fits is judged by what was seen, not by where the map had put it.
+        views = replace(adjusted, ideal=np.where(fits[..., None], ideal, np.nan))
+        noise_px = noise_of(views, fits, good)
         fits, again = fitting(views, max(_LIMIT_PX[turn], _MAX_SIGMAS * noise_px), self._options)
         observed = np.where(fits[..., None], table.observed, np.nan)
         return (
@@ -272,6 +277,13 @@ class Extension:
             good & again,
             noise_px,
         )
+
+    def _with_settled(self, ideal: Array) -> Array:
+        """Return what is seen, old landmarks in old keyframes where the old map puts them."""
+        out, n_old = ideal.copy(), len(self._settled)
+        own = np.isfinite(self._settled)
+        out[:n_old, : self._n_keys][own] = self._settled[own]
+        return out
 
     def _less_ambiguous(self, table: Table, good: Mask) -> tuple[Table, Mask]:
         """Leave out new landmarks that may as well lie where what is beside them does."""
@@ -383,7 +395,7 @@ def _seen_px(observed: Array, column: int) -> Array:
 
 def _adjusted_near(
     views: Views, noise: Array, good: Mask, n_keys: int, options: BundleOptions
-) -> tuple[Views, float]:
+) -> Views:
     """Adjust the new views, the old keyframes that share most with them, and what these see.
 
     The others are held where they are: what they could still learn is little, frame and scale
@@ -397,7 +409,7 @@ def _adjusted_near(
         options: of the adjustment.
 
     Returns:
-        All views with what was adjusted, and the noise of its observations, px.
+        All views with what was adjusted.
     """
     seen = np.asarray(np.isfinite(views.ideal[:, :, 0]) & good[:, None])
     shown = np.any(seen[:, n_keys:], axis=1)
@@ -421,8 +433,8 @@ def _adjusted_near(
         distances=tuple(replace(d, a=int(place[d.a]), b=int(place[d.b])) for d in views.distances),
         n_held=int(np.sum(~moving)),
     )
-    adjusted, noise_px = adjust_weighed(part, noise[rows], options)
+    adjusted, _ = adjust_weighed(part, noise[rows], options)
     points = views.points.copy()
     points[rows] = adjusted.points
     bodies = tuple(adjusted.bodies[place[i]] for i in range(len(order)))
-    return replace(views, bodies=bodies, points=points), noise_px
+    return replace(views, bodies=bodies, points=points)

@@ -22,7 +22,7 @@ from vcl_companion.mapping.common_landmarks import (
     shared_keyframes,
 )
 from vcl_companion.mapping.continuity import broken_continuity, pruned
-from vcl_companion.mapping.culling import Mask, decisive, fitting
+from vcl_companion.mapping.culling import Mask, decisive, fitting, of_landmarks
 from vcl_companion.mapping.extension import ImageFeatures
 from vcl_companion.mapping.growth import Growth
 from vcl_companion.mapping.known_features import Index, KeyframeLibrary, of_keyframes
@@ -31,18 +31,12 @@ from vcl_companion.mapping.options import MOST_PIXELS, MapOptions, NoMap
 from vcl_companion.mapping.patch_table import PyramidOf, decoded_pyramid
 from vcl_companion.mapping.reconstruction import accepted
 from vcl_companion.mapping.registration import MIN_SEEN
+from vcl_companion.mapping.settling import noise_of
 from vcl_companion.mapping.thinning import spread
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
 from vcl_companion.mapping.union import Union, united
-from vcl_companion.vision.bundle import (
-    BundleOptions,
-    Distance,
-    Views,
-    adjust,
-    reprojection_residuals,
-    residual_noise_px,
-)
+from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust
 from vcl_companion.vision.features import Detector
 
 # So many landmarks of both tell how two maps of one world stand, whatever else there is.
@@ -313,22 +307,15 @@ def _settled(
         fits, again = fitting(views, factor * limit_px, options)
         good &= again
         used = replace(views, ideal=np.where(fits[..., None], settled, np.nan))
-        good[np.flatnonzero(good)[decisive(_of(used, good))]] = False
+        good[np.flatnonzero(good)[decisive(of_landmarks(used, good))]] = False
         cauchy_px = max(_LIMIT_PX, 3.0 * noise_px)
-        adjusted, _ = adjust(_of(used, good), BundleOptions(steps, cauchy_px))
+        adjusted, _ = adjust(of_landmarks(used, good), BundleOptions(steps, cauchy_px))
         points = views.points.copy()
         points[good] = adjusted.points
         views = replace(views, bodies=adjusted.bodies, points=points)
     fits, again = fitting(views, limit_px, options)
     good &= again
-    seen = replace(views, ideal=np.where(fits[..., None], views.ideal, np.nan))
-    return views, fits, good, residual_noise_px(reprojection_residuals(_of(seen, good)))
-
-
-def _of(views: Views, good: Mask) -> Views:
-    return replace(
-        views, slopes=views.slopes[good], ideal=views.ideal[good], points=views.points[good]
-    )
+    return views, fits, good, noise_of(views, fits, good)
 
 
 def _tied(seen: Mask, n_old: int) -> Index:

@@ -5,11 +5,7 @@ known to be by then: that ties the maps together by hundredths of a pixel. Unite
 that both have from an image of both; those that are only alike by their descriptors where there are
 neither.
 
-A map's estimate knows more than the observations that it still has: those of keyframes that were
-dropped have made it. Adjusted by what is left alone it would move by as much as is not known any
-more. So each map's own observations are taken where its own estimate puts them: by themselves
-they leave it where it is, as surely as they ever held it, and what is new moves it by as much as
-it should.
+Each map's own observations are taken where its own estimate puts them (``settling``).
 """
 
 from __future__ import annotations
@@ -29,20 +25,14 @@ from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.patch_table import PatchTable, PyramidOf, pyramids_of
 from vcl_companion.mapping.placing import place
 from vcl_companion.mapping.registration import MIN_SEEN
+from vcl_companion.mapping.settling import settled
 from vcl_companion.mapping.uncertainty import views_of
-from vcl_companion.vision.bundle import reprojection_residuals, residual_noise_px
 from vcl_companion.vision.resection import NotFound
 
 # In an image of both maps a landmark of both lies where it did when they parted.
 _SAME_PX = 0.05
 # Keyframes of the other map that show so many patches each tie it to the one, its scale too.
 _LEAST_TIED = 2
-# An observation further from where its map puts it is none of those that it was made of.
-_SETTLED_PX, _SETTLED_SIGMAS = 0.5, 4.0
-# An estimate that is made of its observations, and of more, misses them by no more than so many
-# times the noise that it is said to have: two of one landmark, held by others, by twice as much as
-# if they alone placed it. Maps in flight miss by 0.8 to 1.1 times.
-_MADE_OF = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,22 +130,8 @@ def _are_tied(seen: Array, n_old: int) -> bool:
 
 
 def _seen_and_settled(landmark_map: LandmarkMap, options: MapOptions) -> Array:
-    """Return (N, V, 4) a map's observations, px, and where its estimate puts them, ideal.
-
-    NaN where its estimate puts them elsewhere, and everywhere where most are elsewhere: that is
-    not made of them, and they may put it right.
-    """
-    views = views_of(landmark_map)
-    residuals = reprojection_residuals(views)
-    # A map's word on its noise counts as far as observations may miss at all.
-    noise_px = min(landmark_map.pixel_noise_px, options.max_error_px / _SETTLED_SIGMAS)
-    settled = np.full(landmark_map.observed_px.shape, np.nan)
-    if residual_noise_px(residuals) < _MADE_OF * noise_px:
-        most_px = max(_SETTLED_PX, _SETTLED_SIGMAS * noise_px)
-        here = np.linalg.norm(residuals, axis=2) < most_px
-        away = np.linalg.solve(views.slopes[here], residuals[here][..., None])[..., 0]
-        settled[here] = views.ideal[here] + away
-    return np.concatenate([landmark_map.observed_px, settled], axis=2)
+    """Return (N, V, 4) a map's observations, px, and where its estimate puts them, ideal."""
+    return np.concatenate([landmark_map.observed_px, settled(landmark_map, options)], axis=2)
 
 
 def _brought_distances(
