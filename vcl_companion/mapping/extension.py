@@ -3,7 +3,8 @@
 Old landmarks are found in the new views by their patches, new ones across the
 new views and the keyframes that show best what is new in them, one drone's own
 earlier ones among these; then old and new are adjusted together, measured again from the
-adjusted poses, and adjusted a last time.
+adjusted poses, and adjusted a last time. What the old keyframes show of old landmarks is taken
+where the old map's estimate puts it (``settling``).
 """
 
 from __future__ import annotations
@@ -44,10 +45,11 @@ from vcl_companion.mapping.placing import Placed, place, references
 from vcl_companion.mapping.registration import MIN_SEEN
 from vcl_companion.mapping.settling import noise_of, settled
 from vcl_companion.mapping.sharpening import SETTLED_CAUCHY_PX
+from vcl_companion.mapping.surroundings import adjusted_near
 from vcl_companion.mapping.thinning import spread
+from vcl_companion.mapping.told_pixels import agreed
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
 from vcl_companion.mapping.uncertainty import MapUncertainty, views_of
-from vcl_companion.mapping.weighing import adjust_weighed
 from vcl_companion.vision.bundle import BundleOptions, Distance, Views
 from vcl_companion.vision.features import Detector, Features
 from vcl_companion.vision.resection import NotFound
@@ -58,18 +60,9 @@ ImageFeatures = Callable[[bytes, Camera, Detector], Features]
 _PARTNERS = 3
 _RELATIVE_SIGMA = 0.02
 _STEPS, _LEAST_GAIN = (8, 12), (1e-3, 1e-4)
-# Old keyframes that an extension may still move: so many; of a map of more no more than half of
-# those that share so many landmarks with the new views. The other half holds the scale, which
-# would go a little wrong each time with nothing but far keyframes to hold it.
-_NEAREST, _SHARED = 9, 40
 # Residuals of patches that are the same spot: first loosely, by poses not adjusted yet.
 _LIMIT_PX, _CAUCHY_PX = (1.5, 0.5), (0.5, SETTLED_CAUCHY_PX)
 _MAX_SIGMAS = 4.0
-# An encoder shifts no patch that is found again by more; all of an image by no more than this,
-# root mean square, but for what so few patches have in common by chance.
-_TOLD_PX, _COMMON_PX, _BY_CHANCE = 0.5, 0.03, 3.0
-# Of fewer patches nothing of that kind can be told.
-_LEAST_TOLD = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +253,7 @@ class Extension:
         limit_px = max(_LIMIT_PX[turn], _MAX_SIGMAS * self._old.pixel_noise_px)
         fits, good = fitting(views, 2.0 * limit_px, self._options)
         used = np.where(fits[..., None], self._with_settled(ideal), np.nan)
-        adjusted = _adjusted_near(
+        adjusted = adjusted_near(
             replace(views, ideal=used),
             table.noise,
             good,
@@ -319,7 +312,7 @@ class Extension:
             )
             found = self._table.found(reference, cams, [c], EXACTLY)
             observed[old, c] = np.nan
-            observed[old[which], c] = _told(
+            observed[old[which], c] = agreed(
                 found.pixels[:, c], self._views[joined[at]].told_px, old[which]
             )
             by_view[which, at] = found.noise[:, c]
@@ -365,76 +358,6 @@ class Extension:
         return [b @ m for b, m in zip(table.bodies, self._mountings, strict=True)]
 
 
-def _told(found: Array, told_px: Array | None, landmarks: Index) -> Array:
-    """Return (M, 2) what is found of landmarks in an encoded image, by the image itself if told.
-
-    Only where both are about the same, and not if all of it is shifted, scaled or turned against
-    the encoded image: an encoder errs here and there, and nothing else would show such a lie.
-    """
-    if told_px is None:
-        return found
-    told = told_px[landmarks]
-    off = told - found
-    agrees = np.linalg.norm(off, axis=1) < _TOLD_PX  # never where one of both is not there
-    n = int(agrees.sum())
-    if n < _LEAST_TOLD:
-        return found
-    at = (found[agrees] - found[agrees].mean(axis=0)) / max(float(found[agrees].std()), 1.0)
-    basis = np.column_stack([np.ones(n), at])
-    common = basis @ np.linalg.lstsq(basis, off[agrees], rcond=None)[0]
-    by_chance = off[agrees].std() * np.sqrt(basis.shape[1] / n)
-    if np.sqrt((common**2).mean()) > _COMMON_PX + _BY_CHANCE * by_chance:
-        return found
-    return np.where(agrees[:, None], told, found)
-
-
 def _seen_px(observed: Array, column: int) -> Array:
     pixels = observed[:, column]
     return np.asarray(pixels[np.isfinite(pixels[:, 0])])
-
-
-def _adjusted_near(
-    views: Views, noise: Array, good: Mask, n_keys: int, options: BundleOptions
-) -> Views:
-    """Adjust the new views, the old keyframes that share most with them, and what these see.
-
-    The others are held where they are: what they could still learn is little, frame and scale
-    are theirs, and the cost of an extension does not grow with the map.
-
-    Args:
-        views: of which the first ``n_keys`` are old.
-        noise: (N, 3) of each landmark (``Table.noise``).
-        good: (N,) landmarks to be used.
-        n_keys: see above.
-        options: of the adjustment.
-
-    Returns:
-        All views with what was adjusted.
-    """
-    seen = np.asarray(np.isfinite(views.ideal[:, :, 0]) & good[:, None])
-    shown = np.any(seen[:, n_keys:], axis=1)
-    shared = seen[shown, :n_keys].sum(axis=0)
-    moving = np.zeros(len(views.bodies), dtype=bool)
-    moving[n_keys:] = True
-    n_moving = _NEAREST
-    if n_keys > _NEAREST:
-        n_moving = min(_NEAREST, int((shared >= _SHARED).sum()) // 2)
-    moving[np.argsort(-shared, kind="stable")[:n_moving]] = True
-    moving[0] = False
-    order = np.argsort(moving, kind="stable")
-    place = np.argsort(order)
-    rows = np.flatnonzero((seen & moving).any(axis=1))
-    part = Views(
-        bodies=tuple(views.bodies[i] for i in order),
-        mountings=tuple(views.mountings[i] for i in order),
-        slopes=views.slopes[rows][:, order],
-        ideal=views.ideal[rows][:, order],
-        points=views.points[rows],
-        distances=tuple(replace(d, a=int(place[d.a]), b=int(place[d.b])) for d in views.distances),
-        n_held=int(np.sum(~moving)),
-    )
-    adjusted, _ = adjust_weighed(part, noise[rows], options)
-    points = views.points.copy()
-    points[rows] = adjusted.points
-    bodies = tuple(adjusted.bodies[place[i]] for i in range(len(order)))
-    return replace(views, bodies=bodies, points=points)
