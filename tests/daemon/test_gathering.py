@@ -219,3 +219,21 @@ def test_who_was_away_is_waited_for_again() -> None:
         assert (await rounds.round_s())[0] >= 5.0
 
     run(scenario())
+
+
+@pytest.mark.parametrize("is_update", [True, False])
+def test_who_has_gone_silent_holds_no_update_up(is_update: bool) -> None:
+    async def scenario() -> None:
+        rounds = Rounds(drone_2=0.1, drone_3=None)
+
+        async def two_is_heard() -> None:
+            while True:
+                await asyncio.sleep(0.25)
+                rounds.hear(2)
+
+        async with beside(two_is_heard()):
+            took_s, drones = await rounds.round_s(needs_others=not is_update)
+        assert drones == [2]
+        assert 2.5 <= took_s < 3.5 if is_update else took_s >= 5.0
+
+    run(scenario())

@@ -137,8 +137,9 @@ class Gathering:
         try:
             async with asyncio.timeout(wanted.timeout_s):
                 while not is_over():
-                    believed = set(self._group.trusted).intersection(wanted.members)
-                    open_ = [peer for peer in sorted(believed) if self._is_open(peer, wanted)]
+                    open_ = [
+                        peer for peer in sorted(wanted.members) if self._is_awaited(peer, wanted)
+                    ]
                     has_waited = self._now_s() >= began_at_s + _DUMB_WAIT_S
                     if not open_ or (has_waited and self._is_enough(open_, wanted)):
                         break
@@ -167,6 +168,16 @@ class Gathering:
         off_ns = abs(taken.at_ns - self._wanted.instant_ns(n)) - 2 * taken.bound_ns
         is_placed = frame.world_from_body is not None
         return off_ns > (self._wanted.furthest_ns if is_placed else FURTHEST_NS)
+
+    def _is_awaited(self, member: int, wanted: Wanted) -> bool:
+        """Whether to wait for a member that is believed.
+
+        An update is not held up until who has gone silent is lost: whoever is left flies on, and
+        out of what the map shows. A first map waits for whoever may be there.
+        """
+        group = self._group
+        is_gone = not wanted.needs_others and group.is_silent(member)
+        return member in group.trusted and not is_gone and self._is_open(member, wanted)
 
     def _is_open(self, member: int, wanted: Wanted) -> bool:
         """Whether something of a member is still to come."""
