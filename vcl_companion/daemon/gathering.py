@@ -137,9 +137,7 @@ class Gathering:
         try:
             async with asyncio.timeout(wanted.timeout_s):
                 while not is_over():
-                    open_ = [
-                        peer for peer in sorted(wanted.members) if self._is_awaited(peer, wanted)
-                    ]
+                    open_ = self._awaited(wanted)
                     has_waited = self._now_s() >= began_at_s + _DUMB_WAIT_S
                     if not open_ or (has_waited and self._is_enough(open_, wanted)):
                         break
@@ -169,15 +167,19 @@ class Gathering:
         is_placed = frame.world_from_body is not None
         return off_ns > (self._wanted.furthest_ns if is_placed else FURTHEST_NS)
 
-    def _is_awaited(self, member: int, wanted: Wanted) -> bool:
-        """Whether to wait for a member that is believed.
+    def _awaited(self, wanted: Wanted) -> list[int]:
+        """Return whom to wait for: who is believed and has something still to come, ascending.
 
         An update is not held up until who has gone silent is lost: whoever is left flies on, and
         out of what the map shows. A first map waits for whoever may be there.
         """
-        group = self._group
-        is_gone = not wanted.needs_others and group.is_silent(member)
-        return member in group.trusted and not is_gone and self._is_open(member, wanted)
+        believed = set(self._group.trusted).intersection(wanted.members)
+        return [
+            member
+            for member in sorted(believed)
+            if (wanted.needs_others or not self._group.is_silent(member))
+            and self._is_open(member, wanted)
+        ]
 
     def _is_open(self, member: int, wanted: Wanted) -> bool:
         """Whether something of a member is still to come."""

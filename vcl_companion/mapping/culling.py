@@ -64,10 +64,14 @@ def fitting(views: Views, limit_px: float, options: MapOptions) -> tuple[Mask, M
     cams = [body @ mounting for body, mounting in zip(views.bodies, views.mountings, strict=True)]
     angle = ray_angles(cams, np.nan_to_num(views.points), fits)
     good = (fits.sum(axis=1) >= 2) & (angle > np.deg2rad(options.min_angle_deg))
-    kept = of_landmarks(views, good)
-    vague = depth_errors(replace(kept, ideal=np.where(fits[good][..., None], kept.ideal, np.nan)))
+    vague = depth_errors(of_landmarks(of_observations(views, fits), good))
     good[np.flatnonzero(good)[vague > 2.0 * options.max_depth_error]] = False
     return np.asarray(fits), np.asarray(good)
+
+
+def of_observations(views: Views, fits: Mask) -> Views:
+    """Return the same views with fewer observations: the (N, V) that fit."""
+    return replace(views, ideal=np.where(fits[..., None], views.ideal, np.nan))
 
 
 def of_landmarks(views: Views, good: Mask) -> Views:

@@ -18,7 +18,7 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.apart import ambiguous
-from vcl_companion.mapping.culling import Mask, depth_errors, fitting, placed
+from vcl_companion.mapping.culling import Mask, depth_errors, fitting, of_observations, placed
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.growth import Growth, keyframe_of
 from vcl_companion.mapping.known_features import Index
@@ -43,14 +43,14 @@ from vcl_companion.mapping.patch_table import (
 )
 from vcl_companion.mapping.placing import Placed, place, references
 from vcl_companion.mapping.registration import MIN_SEEN
-from vcl_companion.mapping.settling import noise_of, settled
+from vcl_companion.mapping.settling import believed_noise_px, noise_of, settled
 from vcl_companion.mapping.sharpening import SETTLED_CAUCHY_PX
 from vcl_companion.mapping.surroundings import adjusted_near
 from vcl_companion.mapping.thinning import spread
 from vcl_companion.mapping.told_pixels import agreed
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
-from vcl_companion.mapping.uncertainty import MapUncertainty, views_of
-from vcl_companion.vision.bundle import BundleOptions, Distance, Views
+from vcl_companion.mapping.uncertainty import MapUncertainty, distances_of, views_of
+from vcl_companion.vision.bundle import BundleOptions, Views
 from vcl_companion.vision.features import Detector, Features
 from vcl_companion.vision.resection import NotFound
 
@@ -114,8 +114,9 @@ class Extension:
         self._images = [(v.image_bytes, v.camera) for v in shown_by]
         self._mountings = tuple(v.body_from_cam for v in shown_by)
         self._table = PatchTable(self._cameras, pyramids_of(self._images, pyramid_of))
-        self._relative = depth_errors(views_of(old))
-        self._settled = settled(old, options)
+        known = views_of(old)
+        self._relative = depth_errors(known)
+        self._settled = settled(known, believed_noise_px(old, options))
         self.reasons: dict[int, str] = {}
 
     def run(self) -> Growth | None:
@@ -240,10 +241,7 @@ class Extension:
             slopes=slopes_of_ideal(ideal, self._cameras),
             ideal=ideal,
             points=table.points,
-            distances=tuple(
-                Distance(d.keyframe_a, d.keyframe_b, d.distance_m, d.sigma_m)
-                for d in self._old.distances
-            ),
+            distances=distances_of(self._old.distances),
         )
         if turn == 0:
             fresh = table.source >= 0
@@ -252,17 +250,16 @@ class Extension:
             views = replace(views, points=points)
         limit_px = max(_LIMIT_PX[turn], _MAX_SIGMAS * self._old.pixel_noise_px)
         fits, good = fitting(views, 2.0 * limit_px, self._options)
-        used = np.where(fits[..., None], self._with_settled(ideal), np.nan)
         adjusted = adjusted_near(
-            replace(views, ideal=used),
+            of_observations(replace(views, ideal=self._with_settled(ideal)), fits),
             table.noise,
             good,
             self._n_keys,
             BundleOptions(_STEPS[turn], _CAUCHY_PX[turn], _LEAST_GAIN[turn]),
         )
         # What fits is judged by what was seen, not by where the map had put it.
-        views = replace(adjusted, ideal=np.where(fits[..., None], ideal, np.nan))
-        noise_px = noise_of(views, fits, good)
+        views = of_observations(replace(adjusted, ideal=ideal), fits)
+        noise_px = noise_of(views, good)
         fits, again = fitting(views, max(_LIMIT_PX[turn], _MAX_SIGMAS * noise_px), self._options)
         observed = np.where(fits[..., None], table.observed, np.nan)
         return (

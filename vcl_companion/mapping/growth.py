@@ -9,7 +9,15 @@ import numpy as np
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.culling import LOOSE, Mask, decisive, fitting, placed
+from vcl_companion.mapping.culling import (
+    LOOSE,
+    Mask,
+    decisive,
+    fitting,
+    of_landmarks,
+    of_observations,
+    placed,
+)
 from vcl_companion.mapping.drone_view import DroneView
 from vcl_companion.mapping.joining import Joined
 from vcl_companion.mapping.known_features import Index, KeyframeLibrary
@@ -21,7 +29,8 @@ from vcl_companion.mapping.tracks import (
     join_tracks,
     slopes_of_ideal,
 )
-from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust
+from vcl_companion.mapping.uncertainty import distances_of
+from vcl_companion.vision.bundle import BundleOptions, Views, adjust
 from vcl_companion.vision.essential import sampson_px
 
 # More of them move keyframes by less than half a millimetre.
@@ -85,9 +94,7 @@ def grown(
         slopes=slopes_of_ideal(ideal, cameras),
         ideal=ideal,
         points=np.vstack([old.points_world, np.full((len(ideal) - n_old, 3), np.nan)]),
-        distances=tuple(
-            Distance(d.keyframe_a, d.keyframe_b, d.distance_m, d.sigma_m) for d in old.distances
-        ),
+        distances=distances_of(old.distances),
     )
     noise_px, good = old.pixel_noise_px, np.zeros(len(ideal), dtype=bool)
     for factor, steps in ((LOOSE, _FIRST_STEPS), (1.0, _LAST_STEPS)):
@@ -157,17 +164,11 @@ def _adjusted(
     points[n_old:] = placed(cams, estimate.ideal[n_old:])
     estimate = replace(estimate, points=points)
     fits, good = fitting(estimate, limit_px, options)
-    estimate = replace(estimate, ideal=np.where(fits[..., None], estimate.ideal, np.nan))
-    good[np.flatnonzero(good)[decisive(_of(estimate, good))]] = False
-    adjusted, noise_px = adjust(_of(estimate, good), BundleOptions(max_iterations=steps))
+    estimate = of_observations(estimate, fits)
+    good[np.flatnonzero(good)[decisive(of_landmarks(estimate, good))]] = False
+    adjusted, noise_px = adjust(of_landmarks(estimate, good), BundleOptions(max_iterations=steps))
     points[good] = adjusted.points
     return replace(estimate, bodies=adjusted.bodies, points=points), good, noise_px
-
-
-def _of(views: Views, good: Mask) -> Views:
-    return replace(
-        views, slopes=views.slopes[good], ideal=views.ideal[good], points=views.points[good]
-    )
 
 
 def _observed(

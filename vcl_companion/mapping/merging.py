@@ -22,7 +22,7 @@ from vcl_companion.mapping.common_landmarks import (
     shared_keyframes,
 )
 from vcl_companion.mapping.continuity import broken_continuity, pruned
-from vcl_companion.mapping.culling import Mask, decisive, fitting, of_landmarks
+from vcl_companion.mapping.culling import Mask, decisive, fitting, of_landmarks, of_observations
 from vcl_companion.mapping.extension import ImageFeatures
 from vcl_companion.mapping.growth import Growth
 from vcl_companion.mapping.known_features import Index, KeyframeLibrary, of_keyframes
@@ -31,12 +31,12 @@ from vcl_companion.mapping.options import MOST_PIXELS, MapOptions, NoMap
 from vcl_companion.mapping.patch_table import PyramidOf, decoded_pyramid
 from vcl_companion.mapping.reconstruction import accepted
 from vcl_companion.mapping.registration import MIN_SEEN
-from vcl_companion.mapping.settling import noise_of
+from vcl_companion.mapping.settling import believed_noise_px, noise_of
 from vcl_companion.mapping.thinning import spread
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
-from vcl_companion.mapping.uncertainty import MapUncertainty, map_uncertainty
+from vcl_companion.mapping.uncertainty import MapUncertainty, distances_of, map_uncertainty
 from vcl_companion.mapping.union import Union, united
-from vcl_companion.vision.bundle import BundleOptions, Distance, Views, adjust
+from vcl_companion.vision.bundle import BundleOptions, Views, adjust
 from vcl_companion.vision.features import Detector
 
 # So many landmarks of both tell how two maps of one world stand, whatever else there is.
@@ -235,9 +235,7 @@ def _adjusted(both: Union, senior: Side, junior: Side, options: MapOptions) -> t
         slopes=slopes_of_ideal(ideal, cameras),
         ideal=ideal,
         points=both.points[rows],
-        distances=tuple(
-            Distance(d.keyframe_a, d.keyframe_b, d.distance_m, d.sigma_m) for d in both.distances
-        ),
+        distances=distances_of(both.distances),
     )
     settled = both.settled[rows]
     settled = np.where(np.isfinite(settled), settled, ideal)
@@ -285,8 +283,7 @@ def _with_room(both: Union, n_old: int, options: MapOptions) -> Index:
 
 def _noise_px(senior: Side, junior: Side, options: MapOptions) -> float:
     """Return the noise that observations are judged by: the junior's word counts so far only."""
-    most = options.max_error_px / _MAX_SIGMAS
-    return max(senior.map.pixel_noise_px, min(junior.map.pixel_noise_px, most))
+    return max(senior.map.pixel_noise_px, believed_noise_px(junior.map, options))
 
 
 def _settled(
@@ -306,7 +303,7 @@ def _settled(
         # What missed by the poses of one turn may fit by those of the next.
         fits, again = fitting(views, factor * limit_px, options)
         good &= again
-        used = replace(views, ideal=np.where(fits[..., None], settled, np.nan))
+        used = of_observations(replace(views, ideal=settled), fits)
         good[np.flatnonzero(good)[decisive(of_landmarks(used, good))]] = False
         cauchy_px = max(_LIMIT_PX, 3.0 * noise_px)
         adjusted, _ = adjust(of_landmarks(used, good), BundleOptions(steps, cauchy_px))
@@ -315,7 +312,7 @@ def _settled(
         views = replace(views, bodies=adjusted.bodies, points=points)
     fits, again = fitting(views, limit_px, options)
     good &= again
-    return views, fits, good, noise_of(views, fits, good)
+    return views, fits, good, noise_of(of_observations(views, fits), good)
 
 
 def _tied(seen: Mask, n_old: int) -> Index:

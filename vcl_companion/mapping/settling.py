@@ -9,15 +9,12 @@ what is new moves it by as much as it should.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.culling import Mask, of_landmarks
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import MapOptions
-from vcl_companion.mapping.uncertainty import views_of
 from vcl_companion.vision.bundle import Views, reprojection_residuals, residual_noise_px
 
 # An observation further from where its map puts it is none of those that it was made of.
@@ -28,17 +25,23 @@ _SETTLED_PX, _SETTLED_SIGMAS = 0.5, 4.0
 _MADE_OF = 2.0
 
 
-def settled(landmark_map: LandmarkMap, options: MapOptions) -> Array:
+def believed_noise_px(landmark_map: LandmarkMap, options: MapOptions) -> float:
+    """Return a map's word on its noise, as far as observations may miss at all."""
+    return min(landmark_map.pixel_noise_px, options.max_error_px / _SETTLED_SIGMAS)
+
+
+def settled(views: Views, noise_px: float) -> Array:
     """Return (N, V, 2) ideal image coordinates where a map's estimate puts what it observed.
 
     NaN where its estimate puts them elsewhere, and everywhere where most are elsewhere: that is
     not made of them, and they may put it right.
+
+    Args:
+        views: the map (``views_of``).
+        noise_px: that it is said to have (``believed_noise_px``).
     """
-    views = views_of(landmark_map)
     residuals = reprojection_residuals(views)
-    # A map's word on its noise counts as far as observations may miss at all.
-    noise_px = min(landmark_map.pixel_noise_px, options.max_error_px / _SETTLED_SIGMAS)
-    out = np.full(landmark_map.observed_px.shape, np.nan)
+    out = np.full(views.ideal.shape, np.nan)
     if residual_noise_px(residuals) < _MADE_OF * noise_px:
         most_px = max(_SETTLED_PX, _SETTLED_SIGMAS * noise_px)
         here = np.linalg.norm(residuals, axis=2) < most_px
@@ -47,14 +50,11 @@ def settled(landmark_map: LandmarkMap, options: MapOptions) -> Array:
     return out
 
 
-def noise_of(views: Views, fits: Mask, good: Mask) -> float:
-    """Return the noise, px, of observations that fit; those that were settled have none to show.
+def noise_of(views: Views, good: Mask) -> float:
+    """Return the noise, px, of what was observed; what was settled has none to show.
 
     Args:
-        views: an estimate, with what was observed.
-        fits: (N, V) observations that count.
+        views: an estimate, with the observations that count.
         good: (N,) landmarks that do.
     """
-    seen = of_landmarks(views, good)
-    seen = replace(seen, ideal=np.where(fits[good][..., None], seen.ideal, np.nan))
-    return residual_noise_px(reprojection_residuals(seen))
+    return residual_noise_px(reprojection_residuals(of_landmarks(views, good)))

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from vcl_companion.compiled import writable
 from vcl_companion.geometry.pose import adjoint
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.mapping.landmark_map import Keyframe, LandmarkMap
+from vcl_companion.mapping.landmark_map import Keyframe, KnownDistance, LandmarkMap
 from vcl_companion.mapping.lens_errors import lenses_px, n_lens_causes
 from vcl_companion.mapping.misplacement import N_FIELDS, misplacement
 from vcl_companion.mapping.tracks import ideal_of_pixels, slopes_of_ideal
@@ -118,11 +118,13 @@ def views_of(landmark_map: LandmarkMap) -> Views:
         slopes=slopes_of_ideal(ideal, cameras),
         ideal=ideal,
         points=landmark_map.points_world,
-        distances=tuple(
-            Distance(d.keyframe_a, d.keyframe_b, d.distance_m, d.sigma_m)
-            for d in landmark_map.distances
-        ),
+        distances=distances_of(landmark_map.distances),
     )
+
+
+def distances_of(known: tuple[KnownDistance, ...]) -> tuple[Distance, ...]:
+    """Return known distances as the bundle adjustment sees them."""
+    return tuple(Distance(d.keyframe_a, d.keyframe_b, d.distance_m, d.sigma_m) for d in known)
 
 
 def map_uncertainty(landmark_map: LandmarkMap, calibration_px: float = 0.0) -> MapUncertainty:

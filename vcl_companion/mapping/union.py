@@ -25,8 +25,9 @@ from vcl_companion.mapping.options import MapOptions
 from vcl_companion.mapping.patch_table import PatchTable, PyramidOf, pyramids_of
 from vcl_companion.mapping.placing import place
 from vcl_companion.mapping.registration import MIN_SEEN
-from vcl_companion.mapping.settling import settled
+from vcl_companion.mapping.settling import believed_noise_px, settled
 from vcl_companion.mapping.uncertainty import views_of
+from vcl_companion.vision.bundle import Views
 from vcl_companion.vision.resection import NotFound
 
 # In an image of both maps a landmark of both lies where it did when they parted.
@@ -91,16 +92,17 @@ def united(
         for i in new
     )
     seen = np.full((len(senior.map.points_world), n_old + len(new), 4), np.nan)
-    seen[:, :n_old] = _seen_and_settled(senior.map, options)
+    known = views_of(senior.map)
+    seen[:, :n_old] = _seen_and_settled(senior.map, known, options)
     if options.patches:
-        seen[:, n_old:, :2] = _shown(senior, brought, pyramid_of, options)
+        seen[:, n_old:, :2] = _shown(senior, depth_errors(known), brought, pyramid_of, options)
     row = np.full(len(junior.map.points_world), -1, dtype=np.intp)
     same = _are_same(senior, junior, stands, shared)
     if same.sum() < MIN_COMMON and not _are_tied(seen, n_old):
         same[:] = True
     row[stands.common.junior[same]] = stands.common.senior[same]
     there = np.full((len(row), *seen.shape[1:]), np.nan)
-    there[:, column] = _seen_and_settled(junior.map, options)
+    there[:, column] = _seen_and_settled(junior.map, views_of(junior.map), options)
     seen, points, row = _with_junior(seen, there, senior, junior, stands, row)
     distances = senior.map.distances
     if not one_world:
@@ -129,9 +131,10 @@ def _are_tied(seen: Array, n_old: int) -> bool:
     return int((shown >= MIN_SEEN).sum()) >= _LEAST_TIED
 
 
-def _seen_and_settled(landmark_map: LandmarkMap, options: MapOptions) -> Array:
+def _seen_and_settled(landmark_map: LandmarkMap, views: Views, options: MapOptions) -> Array:
     """Return (N, V, 4) a map's observations, px, and where its estimate puts them, ideal."""
-    return np.concatenate([landmark_map.observed_px, settled(landmark_map, options)], axis=2)
+    where = settled(views, believed_noise_px(landmark_map, options))
+    return np.concatenate([landmark_map.observed_px, where], axis=2)
 
 
 def _brought_distances(
@@ -153,7 +156,11 @@ def _brought_distances(
 
 
 def _shown(
-    senior: Side, brought: tuple[Keyframe, ...], pyramid_of: PyramidOf, options: MapOptions
+    senior: Side,
+    relative: Array,
+    brought: tuple[Keyframe, ...],
+    pyramid_of: PyramidOf,
+    options: MapOptions,
 ) -> Array:
     """Return (N, K, 2) where K keyframes show the senior's landmarks, found by their patches."""
     known = senior.map
@@ -163,7 +170,6 @@ def _shown(
         cameras, pyramids_of([(k.image_bytes, k.camera) for k in all_of_them], pyramid_of)
     )
     cams = [k.world_from_body @ k.body_from_cam for k in known.keyframes]
-    relative = depth_errors(views_of(known))
     out = np.full((len(known.points_world), len(brought), 2), np.nan)
     for i, keyframe in enumerate(brought):
         found = place(
