@@ -24,7 +24,7 @@ from vcl_companion.vision.bundle import (
     Views,
     adjust,
     linearized,
-    normal_equations,
+    robust_cost,
 )
 from vcl_companion.vision.features import detect
 
@@ -39,11 +39,11 @@ _PRIOR = np.diag([0.05**2] * 3 + [np.deg2rad(0.5) ** 2] * 3)
 def adjustment(inputs: Inputs) -> list[Entry]:
     """Adjust poses and landmarks of a map, from beside where they belong."""
     start = _disturbed(inputs)
-    least = normal_equations(adjust(start, BundleOptions())[0], BundleOptions().cauchy_px).cost
+    least = robust_cost(adjust(start, BundleOptions())[0], BundleOptions().cauchy_px)
     problem = _Problem(start, BundleOptions().cauchy_px)
 
     def judge(views: Views) -> Accuracy:
-        cost = normal_equations(views, BundleOptions().cauchy_px).cost
+        cost = robust_cost(views, BundleOptions().cauchy_px)
         n, v = views.ideal.shape[:2]
         return Accuracy(
             f"cost {cost:.3f} px2 ({n} landmarks, {v} views)", cost < (1.0 + _SAME_COST) * least

@@ -9,6 +9,7 @@ import pytest
 
 from tests.mapping.views import map_of
 from tests.scenes import facade_scene, observe
+from vcl_companion.mapping.culling import of_landmarks
 from vcl_companion.mapping.leverage import leverages
 from vcl_companion.mapping.uncertainty import views_of
 
@@ -41,7 +42,7 @@ def test_shares_of_two_views_add_up_to_what_they_determine() -> None:
 def test_too_few_landmarks_decide_everything() -> None:
     views = views_of(map_of(facade_scene(np.random.default_rng(4), 30)))
     seen = np.flatnonzero(np.isfinite(views.ideal[..., 0]).all(axis=1))[:3]
-    few = replace(views, points=views.points[seen], ideal=views.ideal[seen])
+    few = of_landmarks(views, np.isin(np.arange(len(views.points)), seen))
     np.testing.assert_array_equal(leverages(few), 1.0)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.checks import assert_consistent, nees
+from tests.dense_bundle import normal_equations
 from tests.mapping.views import map_of
 from tests.scenes import CAMERAS, Scene, facade_scene
 from vcl_companion.geometry.camera import Camera
@@ -30,7 +31,6 @@ from vcl_companion.vision.bundle import (
     BundleOptions,
     Distance,
     adjust,
-    normal_equations,
 )
 
 

@@ -4,20 +4,23 @@ import numpy as np
 import pytest
 
 from tests.checks import assert_consistent, assert_pose_close, numeric_jacobian
+from tests.dense_bundle import normal_equations, pose_information
 from tests.scenes import EQUIDISTANT, PINHOLE, Scene, facade_scene, perturbed_scene_start
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
+from vcl_companion.vision import bundle
 from vcl_companion.vision.bundle import (
     BundleOptions,
     Distance,
     Views,
     adjust,
+    distance_information,
     linearized,
-    normal_equations,
     relative_sigmas,
     reprojection_residuals,
     residual_noise_px,
+    robust_cost,
 )
 
 OPTIONS = BundleOptions()
@@ -123,7 +126,10 @@ def test_the_right_hand_side_is_the_gradient_of_the_cost(cauchy_px: float | None
             b.retracted(d) for b, d in zip(start.bodies, delta[:18].reshape(3, 6), strict=True)
         )
         moved = replace(start, bodies=bodies, points=start.points + delta[18:].reshape(-1, 3))
-        return np.array([normal_equations(moved, cauchy_px).cost])
+        cost = normal_equations(moved, cauchy_px).cost
+        if cauchy_px is not None:
+            assert robust_cost(moved, cauchy_px) == pytest.approx(cost)
+        return np.array([cost])
 
     gradient = numeric_jacobian(cost, np.zeros(18 + 3 * len(start.points)))[0]
     ours = -2.0 * np.concatenate([system.pose_rhs, system.point_rhs.ravel()])
@@ -137,6 +143,7 @@ def test_a_known_distance_is_one_row() -> None:
     known = Distance(1, 2, 3.0, 0.2)
     views = replace(truth_of(scene), ideal=unseen, points=scene.points_world, distances=(known,))
     system = normal_equations(views, None)
+    np.testing.assert_allclose(distance_information(views), system.pose_block, atol=1e-6)
 
     def error(delta: Array) -> Array:
         a, b = (scene.bodies[i].retracted(delta[6 * i : 6 * i + 6]) for i in (1, 2))
@@ -149,7 +156,45 @@ def test_a_known_distance_is_one_row() -> None:
     np.testing.assert_allclose(system.pose_rhs, -row * at, atol=1e-5)
     assert system.cost == pytest.approx(at**2)
     coincident = replace(views, bodies=(scene.bodies[0],) * 3)
-    assert np.isfinite(normal_equations(coincident, None).pose_block).all()
+    assert np.isfinite(distance_information(coincident)).all()
+
+
+@pytest.mark.parametrize("n_held", [1, 2])
+def test_what_is_known_of_the_poses_is_the_dense_system_without_landmarks(n_held: int) -> None:
+    scene = facade_scene(np.random.default_rng(17), 50, 3.0, n_views=5, noise_px=2.0, missed=0.3)
+    views = replace(truth_of(scene), n_held=n_held)
+    free = slice(6 * n_held, None)
+    dense = pose_information(normal_equations(views, None))
+    scale = np.abs(np.diag(dense)).max()
+    np.testing.assert_allclose(
+        bundle.pose_information(views)[free, free], dense[free, free], atol=1e-6 * scale
+    )
+
+
+def test_leverages_are_the_eigenvalues_of_the_dense_system() -> None:
+    scene = facade_scene(np.random.default_rng(18), 50, 3.0, n_views=5, noise_px=1.0, missed=0.3)
+    views = truth_of(scene)
+    system = normal_equations(views, None)
+    covariance = np.zeros((30, 30))
+    covariance[6:, 6:] = np.linalg.inv(pose_information(system)[6:, 6:])
+    root = np.linalg.cholesky(covariance[6:, 6:])
+    expected = []
+    for j in range(len(views.points)):
+        alone = normal_equations(
+            replace(
+                views,
+                slopes=views.slopes[j : j + 1],
+                ideal=views.ideal[j : j + 1],
+                points=views.points[j : j + 1],
+                distances=(),
+            ),
+            None,
+        )
+        says = pose_information(alone)[6:, 6:]
+        expected.append(np.linalg.eigvalsh(root.T @ says @ root)[-1])
+    found = bundle.leverages(views, covariance)
+    np.testing.assert_allclose(found, expected, rtol=1e-2, atol=1e-6)
+    assert found.max() > 3.0 * found.min()
 
 
 @pytest.mark.parametrize("n_views", [2, 3, 5])

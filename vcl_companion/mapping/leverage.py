@@ -13,11 +13,13 @@ from dataclasses import replace
 import numpy as np
 
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.vision.bundle import Views, linearized, normal_equations
-from vcl_companion.vision.schur import eliminated
+from vcl_companion.vision import bundle
+from vcl_companion.vision.bundle import Views, pose_information
+from vcl_companion.vision.information import covariance_of
 
 # By fewer landmarks no view is placed.
 _LEAST_SEEN = 10
+_SINGULAR = 1e-10
 
 
 def leverages(views: Views) -> Array:
@@ -68,38 +70,9 @@ def _of_supported(views: Views) -> Array | None:
 
 def _shares(views: Views) -> Array | None:
     """Return what ``leverages`` does; None where all together do not fix the poses."""
-    n, v = views.ideal.shape[:2]
-    try:
-        system = normal_equations(views, None)
-        inverse = np.asarray(np.linalg.inv(system.point_block), dtype=np.float64)
-        total = system.pose_block - eliminated(system.cross, inverse, system.seen)
-        covariance = np.zeros_like(total)
-        covariance[6:, 6:] = np.linalg.inv(total[6:, 6:])
-        np.linalg.cholesky(total[6:, 6:])
-    except np.linalg.LinAlgError:
+    known = covariance_of(pose_information(views)[6:, 6:], _SINGULAR)
+    if known is None:
         return None
-    by_pose, by_point = np.zeros((n, v, 2, 6)), np.zeros((n, v, 2, 3))
-    seen = np.isfinite(views.ideal[:, :, 0])
-    for i in range(v):
-        j = np.flatnonzero(seen[:, i])
-        _, by_pose[j, i], by_point[j, i] = linearized(
-            views.bodies[i],
-            views.mountings[i],
-            views.slopes[j, i],
-            views.points[j],
-            views.ideal[j, i],
-        )
-    shares = np.ones(n)
-    n_seen = seen.sum(axis=1)
-    for s in np.unique(n_seen[n_seen >= 2]):
-        # Only the s views that see a landmark enter its own share: small matrices.
-        j = np.flatnonzero(n_seen == s)
-        at = np.nonzero(seen[j])[1].reshape(-1, s)
-        pose = by_pose[j[:, None], at]
-        point = by_point[j[:, None], at].reshape(-1, 2 * s, 3)
-        blocks = covariance.reshape(v, 6, v, 6)[at[:, :, None], :, at[:, None, :], :]
-        spread = np.einsum("naki,nabij,nblj->nakbl", pose, blocks, pose, optimize=True)
-        spread = spread.reshape(-1, 2 * s, 2 * s)
-        across = np.eye(2 * s) - point @ np.linalg.pinv(point)
-        shares[j] = np.linalg.eigvalsh(across @ spread @ across)[:, -1]
-    return np.asarray(np.clip(np.nan_to_num(shares, nan=1.0), 0.0, 1.0))
+    covariance = np.zeros((6 * len(views.bodies),) * 2)
+    covariance[6:, 6:] = known
+    return np.clip(bundle.leverages(views, covariance), 0.0, 1.0)

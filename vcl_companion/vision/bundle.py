@@ -18,8 +18,11 @@ from vcl_companion.compiled import writable
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, skew
 from vcl_companion.vision import bundle_kernels as kernels
+from vcl_companion.vision.leverage_kernels import leverages as of_landmarks
 
 _MIN_DEPTH_M = 1e-3
+# By so many pixels no weight falls.
+_NOT_ROBUST_PX = 1e9
 
 
 @dataclass(frozen=True)
@@ -71,29 +74,6 @@ class BundleOptions:
     least_gain: float = 1e-7
 
 
-@dataclass(frozen=True, eq=False)
-class NormalEquations:
-    """The Gauss-Newton system at one estimate, landmarks not yet eliminated.
-
-    Attributes:
-        pose_block: (6V, 6V) normal matrix of the poses, distances included.
-        pose_rhs: (6V,) negative gradient.
-        point_block: (N, 3, 3) normal matrix of each point.
-        point_rhs: (N, 3) negative gradient.
-        cross: (N, 6V, 3) pose-point coupling.
-        seen: (N, V) bool, which view sees which point.
-        cost: robust cost, px^2 (distances weighted to the same unit).
-    """
-
-    pose_block: Array
-    pose_rhs: Array
-    point_block: Array
-    point_rhs: Array
-    cross: Array
-    seen: NDArray[np.bool_]
-    cost: float
-
-
 def reprojection_residuals(views: Views) -> Array:
     """Return (N, V, 2) projected minus observed, px; NaN where unseen or behind the camera."""
     cams = matrices_of(tuple(_world_from_cam(views, i).inverse() for i in range(len(views.bodies))))
@@ -139,6 +119,32 @@ def adjust(
         system = problem.system(views, damping)
     del system
     return views, residual_noise_px(reprojection_residuals(views))
+
+
+def robust_cost(views: Views, cauchy_px: float) -> float:
+    """Return what ``adjust`` makes least, px^2; distances are weighed to the same unit."""
+    return _Problem(views, cauchy_px).cost(views)
+
+
+def pose_information(views: Views) -> Array:
+    """Return the (6V, 6V) normal matrix of the poses, landmarks eliminated, for 1 px of noise.
+
+    All observations count alike. Rows of the held poses stay zero but for known distances.
+    """
+    return _Problem(views, _NOT_ROBUST_PX).system(views, 0.0).normal
+
+
+def leverages(views: Views, covariance: Array) -> Array:
+    """Return (N,) how much of some motion of the poses each landmark decides, 0 to 1.
+
+    The largest eigenvalue of what its observations say of the poses, its own position
+    eliminated, against what is known of them.
+
+    Args:
+        views: an estimate.
+        covariance: (6V, 6V) of the poses, for 1 px of noise, zero for the held ones.
+    """
+    return of_landmarks(*_Problem(views, 1.0).arguments(views), covariance)
 
 
 def relative_sigmas(views: Views) -> Array:
@@ -250,49 +256,6 @@ def residual_noise_px(residuals: Array) -> float:
     return float(max(np.sqrt(np.median(squared / expected)), 0.02))
 
 
-def normal_equations(views: Views, cauchy_px: float | None) -> NormalEquations:
-    """Linearise every observation and distance at the present estimate (eq. 4, many views).
-
-    Args:
-        views: where to linearise.
-        cauchy_px: scale of the robust weight; None weighs all observations one.
-    """
-    n, v = views.ideal.shape[:2]
-    pose_block = np.zeros((6 * v, 6 * v))
-    pose_rhs = np.zeros(6 * v)
-    point_block = np.zeros((n, 3, 3))
-    point_rhs = np.zeros((n, 3))
-    cross = np.zeros((n, 6 * v, 3))
-    cost = 0.0
-    for i in range(v):
-        seen = np.flatnonzero(np.isfinite(views.ideal[:, i, 0]))
-        if len(seen) == 0:
-            continue
-        residual, j_pose, j_point = linearized(
-            views.bodies[i],
-            views.mountings[i],
-            views.slopes[seen, i],
-            views.points[seen],
-            views.ideal[seen, i],
-        )
-        weight, loss = _robust(residual, cauchy_px)
-        cost += loss
-        weighted_pose = j_pose * weight[:, None, None]
-        weighted_point = j_point * weight[:, None, None]
-        block = slice(6 * i, 6 * i + 6)
-        # As products of matrices: numpy's sums over several indices take four times as long.
-        flat = weighted_pose.reshape(-1, 6).T
-        pose_block[block, block] += flat @ j_pose.reshape(-1, 6)
-        pose_rhs[block] -= flat @ residual.ravel()
-        point_block[seen] += np.swapaxes(weighted_point, 1, 2) @ j_point
-        point_rhs[seen] -= np.einsum("nki,nk->ni", weighted_point, residual)
-        cross[seen, block] += np.swapaxes(weighted_pose, 1, 2) @ j_point
-    for known in views.distances:
-        cost += _add_distance(views, known, pose_block, pose_rhs)
-    in_view = np.ascontiguousarray(np.isfinite(views.ideal[:, :, 0]))
-    return NormalEquations(pose_block, pose_rhs, point_block, point_rhs, cross, in_view, cost)
-
-
 def distance_information(views: Views) -> Array:
     """Return the (6V, 6V) normal matrix of the known distances alone."""
     size = 6 * len(views.bodies)
@@ -337,14 +300,6 @@ def linearized(
     j_pose[:, :, :3] = -j_body
     j_pose[:, :, 3:] = j_body @ skew(points_body)
     return residual, j_pose, j_body @ world_from_body.rotation.T
-
-
-def _robust(residual: Array, cauchy_px: float | None) -> tuple[Array, float]:
-    squared = np.einsum("nk,nk->n", residual, residual)
-    if cauchy_px is None:
-        return np.ones(len(residual)), float(squared.sum())
-    scaled = squared / cauchy_px**2
-    return 1.0 / (1.0 + scaled), float(cauchy_px**2 * np.log1p(scaled).sum())
 
 
 def _add_distance(

@@ -1,6 +1,6 @@
-"""Landmarks and the views that see them, in compiled code: eliminated, and moved with them.
+"""What landmarks are off by with the views that see them, in compiled code.
 
-A landmark couples the few views that see it, not all: the cost is linear in
+A landmark hangs on the few views that see it, not on all: the cost is linear in
 keyframes. One thread: on a busy computer BLAS waits for its own threads longer
 than it computes.
 """
@@ -10,52 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vcl_companion.compiled import compiled, reordered
+from vcl_companion.compiled import reordered
 from vcl_companion.geometry.rotation import Array
-
-
-@compiled
-def eliminated(cross: Array, inverse: Array, seen: NDArray[np.bool_]) -> Array:
-    """Return (6V, 6V), the sum over landmarks of cross @ inverse @ cross transposed.
-
-    Args:
-        cross: (N, 6V, 3) pose-point coupling, zero for views that do not see the point.
-        inverse: (N, 3, 3) symmetric, of the points' own normal matrices.
-        seen: (N, V).
-    """
-    n, size, _ = cross.shape
-    v = size // 6
-    out = np.zeros((size, size))
-    views = np.empty(v, dtype=np.int64)
-    left = np.empty((6, 3))
-    for j in range(n):
-        s = 0
-        for i in range(v):
-            if seen[j, i]:
-                views[s] = i
-                s += 1
-        for p in range(s):
-            a = 6 * views[p]
-            for r in range(6):
-                for c in range(3):
-                    left[r, c] = (
-                        cross[j, a + r, 0] * inverse[j, 0, c]
-                        + cross[j, a + r, 1] * inverse[j, 1, c]
-                        + cross[j, a + r, 2] * inverse[j, 2, c]
-                    )
-            for q in range(p + 1):
-                b = 6 * views[q]
-                for r in range(6):
-                    for c in range(6):
-                        out[a + r, b + c] += (
-                            left[r, 0] * cross[j, b + c, 0]
-                            + left[r, 1] * cross[j, b + c, 1]
-                            + left[r, 2] * cross[j, b + c, 2]
-                        )
-    for a in range(size):
-        for b in range(a):
-            out[b, a] = out[a, b]
-    return out
 
 
 @reordered

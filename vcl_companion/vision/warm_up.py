@@ -18,6 +18,7 @@ from vcl_companion.vision.bundle import (
     Distance,
     Views,
     adjust,
+    leverages,
     matrices_of,
     observations_of,
     relative_sigmas,
@@ -38,7 +39,7 @@ from vcl_companion.vision.patches import (
     pyramid_of,
 )
 from vcl_companion.vision.relative_pose import essential_candidates
-from vcl_companion.vision.schur import carried, eliminated
+from vcl_companion.vision.schur import carried
 from vcl_companion.vision.surface_kernels import inclinations
 from vcl_companion.vision.texture import textures
 from vcl_companion.vision.triangulation import ray_angles
@@ -52,7 +53,6 @@ def warm_up() -> None:
     ideal_a, ideal_b = points[:, :2] / points[:, 2:], moved[:, :2] / moved[:, 2:]
     essential_candidates(ideal_a, ideal_b, 320.0, rng)
     resect(ideal_b, points, 320.0, rng)
-    eliminated(np.zeros((1, 6, 3)), np.zeros((1, 3, 3)), np.ones((1, 1), dtype=np.bool_))
     carried(np.ones((1, 3, 6), np.float32), np.eye(6), np.zeros(1, np.int64))
     _join(points)
     descriptors = np.asarray(rng.integers(0, 255, (40, 61)), dtype=np.uint8)
@@ -96,6 +96,7 @@ def _adjust(points: Array) -> None:
     )
     adjust(views, BundleOptions(max_iterations=2))
     relative_sigmas(views)
+    leverages(views, np.eye(12))
     ray_angles(list(bodies), points, np.ones((len(points), 2), dtype=np.bool_))
     n = len(points)
     near = np.tile(np.arange(4, dtype=np.int64), (n, 1))

@@ -17,7 +17,7 @@ from sitl.bench.steps_report import write_steps
 from sitl.bench.timing import Accuracy, Effort, Entry, Measured, measured
 from tests.checks import numeric_jacobian
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.vision.bundle import normal_equations
+from vcl_companion.vision.bundle import robust_cost
 
 
 @cache
@@ -119,7 +119,7 @@ def test_the_adjustment_s_rival_solves_the_same_problem() -> None:
     rng = np.random.default_rng(0)
     steps = 0.01 * rng.standard_normal(problem.size)
     residuals = problem.residuals(steps)
-    cost = normal_equations(problem.views(steps), 1.5).cost
+    cost = robust_cost(problem.views(steps), 1.5)
     assert float(residuals @ residuals) == pytest.approx(cost, rel=1e-9)
     # All poses, and the first landmarks.
     n = 6 * (len(start.bodies) - 1) + 9
