@@ -209,11 +209,14 @@ class StandIn:
         return max(0.0, self._next_heartbeat_s - now_s)
 
     def _beat(self) -> None:
+        # Without a position ArduCopter is not armed in GUIDED; in the air it stays so without one.
+        has_had_position = self._fusing.at(self._now_ns or 0) is not None
+        armed = dialect.MAV_MODE_FLAG_SAFETY_ARMED if has_had_position else 0
         self._send(
             dialect.MAVLink_heartbeat_message(
                 dialect.MAV_TYPE_QUADROTOR,
                 dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
-                dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED,
+                dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | armed,
                 4,  # ArduCopter's GUIDED
                 dialect.MAV_STATE_ACTIVE,
                 3,

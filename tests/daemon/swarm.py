@@ -28,6 +28,7 @@ from vcl_companion.daemon.exchange import Exchange, ExchangeOptions
 from vcl_companion.daemon.flight_log import FlightLog
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
+from vcl_companion.daemon.map_in_flight import MapInFlight
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.message_requests import MessageRequests
@@ -130,9 +131,10 @@ class Drone:
         self.exchange.attach(self._link)
         frames_alone = AutopilotOptions(min_rate_hz=0.0)
         self.teller = Teller(self.autopilot_link, self.estimator, clock, self.log, frames_alone)
+        self.in_flight = MapInFlight(self.maps, executor)
         self.saved = SavedMap(
-            self.maps, self.exchange.go_back_to, self.estimator, executor, self.autopilot_link,
-            self.log,
+            self.maps, self.in_flight, self.exchange.go_back_to, self.estimator, executor,
+            self.autopilot_link, self.log,
         )  # fmt: skip
         self.computer = OnboardComputer(log_path.parent)
         self.messages = MessageRequests(self.autopilot_link, self.computer, executor)
@@ -147,6 +149,7 @@ class Drone:
             for part in (self.autopilot_link, self._link, self.messages, self.parameters):
                 parts.create_task(part.run())
             await self.saved.begin()
+            parts.create_task(self.in_flight.run())
             parts.create_task(self.exchange.run())
 
     def close(self) -> None:
@@ -459,8 +462,10 @@ class Swarm:
         await self._lives[drone.system_id].enter_async_context(beside(drone.run()))
         await drone.autopilot.states.get()
 
-    async def stop(self, drone: Drone | Stranger) -> None:
-        """End a drone."""
+    async def stop(self, drone: Drone | Stranger, *, dies: bool = False) -> None:
+        """End a drone, as somebody who asks for that, or as it is killed."""
+        if isinstance(drone, Drone) and not dies:
+            drone.in_flight.ended()
         await self._lives[drone.system_id].aclose()
 
     async def stranger(self, system_id: int) -> Stranger:

@@ -8,6 +8,7 @@ import pytest
 from tests.daemon import demo
 from tests.daemon.swarm import Drone, Swarm, swarm
 from tests.daemon.waiting import computed, passes, passes_until, run, until
+from vcl_companion.daemon.map_in_flight import NOTE_FILE
 from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
 
 SAVE, RELOAD = 31011, 31012
@@ -34,7 +35,8 @@ def test_what_was_saved_is_flown_on_after_a_restart_until_it_is_forgotten(tmp_pa
             await one.see(demo.frame(1, 0))
             assert await answered(one, SAVE) == ACCEPTED
             assert (place / SAVED).read_bytes() == MAP
-            assert [path.name for path in place.iterdir()] == [SAVED]
+            await until(lambda: (place / NOTE_FILE).exists())
+            assert sorted(path.name for path in place.iterdir()) == [NOTE_FILE, SAVED]
             n_landmarks = len(demo.map_index(1, 2).landmark_map.points_world)
             assert f"VCL map saved: {n_landmarks} landmarks" in one.autopilot.said_texts()
             await members.stop(one)

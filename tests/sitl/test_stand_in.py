@@ -234,6 +234,27 @@ def test_it_knows_no_north_until_it_is_told_poses(tmp_path: Path) -> None:
     np.testing.assert_allclose(after, 1.2, atol=1e-3)
 
 
+def test_it_is_armed_from_its_first_position_on(tmp_path: Path) -> None:
+    clock = ManualClock(START_NS)
+
+    async def scenario() -> None:
+        async with stand_in(tmp_path / "mav", truth(tmp_path)) as process:
+            await process.advance_to(START_NS)
+            link = link_to(process.port, clock)
+            async with running(link.run()):
+                await until(lambda: link.has_been_heard)
+                assert await link.attitudes.at(START_NS, LONGEST_S) is not None
+                assert not link.mode.is_armed
+                still = PoseEstimate(
+                    Pose.identity(), np.eye(6), np.zeros(3), np.eye(3), START_NS, 0
+                )
+                assert link.poses.send(still) is None
+                await until(lambda: link.mode.is_steered_by_positions)
+            await process.finish()
+
+    asyncio.run(scenario())
+
+
 def test_its_errors_are_what_it_states(tmp_path: Path) -> None:
     path = tmp_path / "truth.csv"
     write_trajectory(path)

@@ -34,6 +34,7 @@ from vcl_companion.daemon.forked import END_SIGNALS
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.health import Health
 from vcl_companion.daemon.local_frame import origin_in_leaders_world
+from vcl_companion.daemon.map_in_flight import MapInFlight
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.memory_watch import MemoryWatch
@@ -251,14 +252,17 @@ async def _run(config: Config) -> int:
     if isinstance(camera, StreamCamera):  # no other camera asks, or is asked for each frame
         camera.is_busy = exchange.is_busy
         camera.left_out = outcomes.undecodable
-    saved = SavedMap(maps, exchange.go_back_to, estimator, disk, autopilot, log)
+    in_flight = MapInFlight(maps, disk)
+    saved = SavedMap(maps, in_flight, exchange.go_back_to, estimator, disk, autopilot, log)
     requests = MessageRequests(autopilot, OnboardComputer(Path()), disk)
     commands = Commands(autopilot, exchange, maps, estimator, teller, saved, requests, log)
     parameters = open_settings(autopilot, exchange, commands, log)
 
     async def exchanging() -> None:
         await saved.begin()  # before anybody makes a first map
-        await exchange.run()
+        async with asyncio.TaskGroup() as parts:
+            parts.create_task(in_flight.run())
+            parts.create_task(exchange.run())
 
     memory = MemoryWatch(work.pid)
     watching = [health.run(), requests.run(), parameters.run(), memory.run()]
@@ -279,6 +283,7 @@ async def _run(config: Config) -> int:
             *watching,
             ends_all=companion.read_camera(),
         )
+        in_flight.ended()
     finally:
         try:
             outcomes.end()

@@ -178,7 +178,7 @@ class MapStore:
             await self._decided.wait()
         return self.current
 
-    async def newer_than(self, stored: StoredMap) -> None:
+    async def newer_than(self, stored: StoredMap | None) -> None:
         """Wait until another map than this one is in use, or a better index of it."""
         while self.current is stored:
             self._decided.clear()
@@ -191,15 +191,31 @@ class MapStore:
         leaves no half map. A disk that is full must not end the flight: the
         failure is logged. Nor must maps fill it: the oldest have to go.
         """
-        if self._directory is None:
+        path = self._file_of(stored.revision)
+        if self._directory is None or path is None:
             return
-        path = self._directory / f"{stored.revision.hex()}.vclmap"
         try:
             write_whole(path, stored.data)
             self._written[path] = len(self._written)
             _remove_oldest(self._directory, self._kept_bytes, self._written)
         except OSError as error:
             _log.error("the map %s cannot be kept: %s", path, error.strerror)
+
+    @property
+    def directory(self) -> Path | None:
+        """Where revisions are kept; None for nowhere."""
+        return self._directory
+
+    def kept(self, revision: bytes) -> bytes:
+        """Return an encoded revision that was kept; nothing is known of its bytes. Any thread may.
+
+        Raises:
+            OSError: it cannot be read; FileNotFoundError: it was not kept, or is not any more.
+        """
+        return _read(self._file_of(revision))
+
+    def _file_of(self, revision: bytes) -> Path | None:
+        return self._directory and self._directory / f"{revision.hex()}.vclmap"
 
     @property
     def saved_file(self) -> Path | None:
@@ -221,13 +237,7 @@ class MapStore:
         Raises:
             OSError: it cannot be read; FileNotFoundError: there is none.
         """
-        if self.saved_file is None:
-            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
-        with self.saved_file.open("rb") as file:
-            data = file.read(_MAX_FILE_BYTES + 1)
-        if len(data) > _MAX_FILE_BYTES:
-            raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
-        return data
+        return _read(self.saved_file)
 
     def forget_saved(self) -> None:
         """Begin with no map after a restart; any thread may.
@@ -237,6 +247,16 @@ class MapStore:
         """
         if self.saved_file is not None:
             self.saved_file.unlink(missing_ok=True)
+
+
+def _read(path: Path | None) -> bytes:
+    if path is None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+    with path.open("rb") as file:
+        data = file.read(_MAX_FILE_BYTES + 1)
+    if len(data) > _MAX_FILE_BYTES:
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+    return data
 
 
 def _remove_oldest(directory: Path, kept_bytes: int, written: Mapping[Path, int]) -> None:

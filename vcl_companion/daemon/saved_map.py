@@ -1,7 +1,8 @@
 """The map that a drone begins with after a restart: saved when the ground says so, and taken again.
 
 It lies beside the revisions that are kept anyway (``map.directory``), and stays until another one
-is saved or it is forgotten: a drone that begins with a map makes no first one.
+is saved or it is forgotten: a drone that begins with a map makes no first one. Before it goes the
+one that the last service died on, where the drone is in the air.
 """
 
 from __future__ import annotations
@@ -10,14 +11,18 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable
 from concurrent.futures import Executor
+from contextlib import suppress
 
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
+from vcl_companion.daemon.map_in_flight import MapInFlight
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.texts import Severity
 
 _log = logging.getLogger(__name__)
+
+_HEARD_S, _LOOK_S = 3.0, 0.02
 
 
 class SavedMap:
@@ -25,6 +30,7 @@ class SavedMap:
 
     Args:
         maps: the map in use, and the file.
+        in_flight: the map that the last service was on.
         go_back_to: flies on an encoded map, or returns why not.
         estimator: where we are.
         disk: reads and writes.
@@ -35,6 +41,7 @@ class SavedMap:
     def __init__(
         self,
         maps: MapStore,
+        in_flight: MapInFlight,
         go_back_to: Callable[[bytes], Awaitable[str]],
         estimator: Estimator,
         disk: Executor,
@@ -42,6 +49,7 @@ class SavedMap:
         log: FlightLog,
     ) -> None:
         self._maps = maps
+        self._in_flight = in_flight
         self._go_back_to = go_back_to
         self._estimator = estimator
         self._disk = disk
@@ -81,11 +89,31 @@ class SavedMap:
 
     async def begin(self) -> None:
         """Begin with it, if there is one; one that cannot be used is told of and left alone."""
+        if await self._goes_on():
+            return
         refused = await self._taken()
         if refused:
             self._failed("saved map not taken", refused)
         elif refused is not None:
             self._done("begins on the saved map")
+
+    async def _goes_on(self) -> bool:
+        """Go on with the map that the last service died on; whether we do."""
+        data = await self._on_disk(self._in_flight.left_behind)
+        if not data or not await self._is_in_the_air():
+            return False
+        refused = await self._go_back_to(data)
+        if refused:
+            return self._failed("map of before not taken", refused)
+        return self._done("goes on with the map of before")
+
+    async def _is_in_the_air(self) -> bool:
+        """Whether the autopilot is armed, as its next heartbeat says: it has one a second."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_HEARD_S):
+                while not self._autopilot.has_been_heard:
+                    await asyncio.sleep(_LOOK_S)
+        return self._autopilot.mode.is_armed
 
     async def _taken(self) -> str | None:
         """Fly on it; return why it cannot be used, or nothing; None where there is none."""
