@@ -93,7 +93,9 @@ async def flying(
             camera,
             FrameOutcomes(camera, drone.clock, health, drone.log),
             own_fixes,
-            CatchingUp(drone.exchange.frames, drone.maps, drone.estimator, own_fixes),
+            CatchingUp(
+                drone.system_id, drone.exchange.frames, drone.maps, drone.estimator, own_fixes
+            ),
             PeerPoses(drone.exchange.inter, drone.maps, drone.estimator, drone.log),
             drone.teller,
             drone.maps,

@@ -244,7 +244,9 @@ class Flyer(Drone):
             )  # fmt: skip
             companion = Companion(
                 source, FrameOutcomes(source, self.clock, health, self.log), own_fixes,
-                CatchingUp(self.exchange.frames, self.maps, self.estimator, own_fixes),
+                CatchingUp(
+                    self.system_id, self.exchange.frames, self.maps, self.estimator, own_fixes,
+                ),
                 PeerPoses(self.exchange.inter, self.maps, self.estimator, self.log), self.teller,
                 self.maps, self.estimator, self.exchange.on_frame, health, self.work,
                 frame_wait_s=0.1,

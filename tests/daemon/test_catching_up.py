@@ -17,6 +17,7 @@ from vcl_companion.daemon.frame_choice import FrameChoice
 from vcl_companion.localization.filter_state import FilterState
 
 FOUND, LOST = (0, 1), (2, 3, 4)
+NO_MAP = "no map: none yet"
 
 
 def at_ns(k: int) -> int:
@@ -59,6 +60,47 @@ def test_what_was_lost_is_followed_on_the_next_map_up_to_the_newest(tmp_path: Pa
             assert [outcome for _, outcome, _ in up.frames()] == (
                 ["localized"] * len(FOUND) + ["refused"] * len(LOST)
             )
+
+    run(scenario())
+
+
+def test_who_had_no_fix_yet_goes_on_from_its_keyframe_where_no_features_are(
+    tmp_path: Path,
+) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            for k in range(4):
+                up.give(k)
+                await until(lambda k=k: up.history.has(at_ns(k)))  # type: ignore[misc]
+                await until(lambda k=k: len(up.frames()) == k)  # type: ignore[misc]
+            assert up.frames() == [(k, "refused", NO_MAP) for k in range(3)]
+            up.fly_on_nothing_known(tracked=True)
+            await up.server.answered()
+            assert up.server.outcomes[3] == "localized"
+            for k in (0, 3):
+                state = up.estimator.own_fix_at(at_ns(k))
+                assert state is not None
+                off = demo.world_from_body(DRONE, k).local(state.world_from_body)
+                assert np.linalg.norm(off[:3]) < 0.05
+            assert up.autopilot.poses.qsize() == 1  # of the newest
+
+    run(scenario())
+
+
+def test_what_was_forgotten_is_not_begun_with(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            for k in range(2):
+                up.give(k)
+                await up.server.answered()
+            up.estimator.forget()
+            up.fly_on_nothing_known(tracked=True)
+            for k in range(2, 4):
+                up.give(k)
+                await up.server.answered()
+            assert [up.server.outcomes[k] for k in range(4)] == ["localized"] * 2 + ["refused"] * 2
+            assert up.estimator.own_fix_at(at_ns(0)) is None
 
     run(scenario())
 

@@ -208,7 +208,7 @@ async def flight(
         )
         estimator.keep_of(history.has)
         companion = Companion(
-            camera, outcomes, own_fixes, CatchingUp(history, maps, estimator, own_fixes),
+            camera, outcomes, own_fixes, CatchingUp(DRONE, history, maps, estimator, own_fixes),
             peer_poses, teller, maps, estimator, history.add, health, work, frame_wait_s,
         )  # fmt: skip
         await stack.enter_async_context(beside(link.run()))

@@ -66,6 +66,24 @@ def test_of_the_ten_seconds_before_about_one_a_second_is_here() -> None:
     assert nearest_ms(history, 29_900 - 14_000) is None
 
 
+def test_what_a_map_may_be_made_of_is_here_until_the_next_and_what_came_since() -> None:
+    history = FrameHistory()
+    given = frame(0)
+    for at_ms in range(0, 11_000, 100):
+        history.add(given if at_ms == 0 else frame(at_ms))
+        if at_ms == 0:
+            history.gave(given)
+    assert history.has(0)
+    assert [f.captured_at_ns for f in history.after(-1)].count(0) == 1
+    since = [f.captured_at_ns // MS for f in history.after(0)]
+    assert max(np.diff([0, *since])) <= 200
+    history.gave(frame(10_900))
+    for at_ms in range(11_000, 40_000, 100):
+        history.add(frame(at_ms))
+    assert not history.has(0)
+    assert history.has(10_900 * MS)
+
+
 def test_it_does_not_grow() -> None:
     history = FrameHistory()
     for k in range(1000):

@@ -270,6 +270,44 @@ def test_frames_of_another_world_begin_nothing() -> None:
     run(scenario())
 
 
+@pytest.mark.parametrize("n_jumps", [1, 2])
+def test_who_was_elsewhere_goes_on_by_own_frames_from_there(n_jumps: int) -> None:
+    async def scenario() -> None:
+        _, templates = chart()
+        by = Pose(exp_so3(np.array([0.0, 0.0, 0.1])), np.array([2.0, -3.0, 0.4]))
+        small = np.diag(np.repeat([0.01, 0.001], 3) ** 2)
+        async with making() as odometry:
+            for k in range(5):
+                truth = truth_at(1.0 + 0.3 * k)
+                image = photograph(truth, np.random.default_rng(k))
+                fix = follow(
+                    image, PINHOLE, MOUNTING, templates, Prior(truth, small), None, OPTIONS
+                )
+                assert isinstance(fix, Localized)
+                told = replace(fix, covered=0.8)
+                odometry.note(Frame(image, k * 10**8, k, 0), told, templates, WORLD)
+            assert await odometry.begun(WORLD) is not None
+            world = WORLD[0], n_jumps
+            odometry.displaced(by, by @ truth, small, world)
+            assert odometry.templates_in(world) is None
+            local = await odometry.begun(world)
+            # Of two jumps at once nobody knows where the first one led.
+            assert (local is not None) == (n_jumps == 1)
+            if local is None:
+                return
+            next_one = truth_at(2.3)
+            image = photograph(next_one, np.random.default_rng(9))
+            expected = Prior((by @ next_one).retracted(0.01 * np.ones(6)), 4.0 * small)
+            found = follow_own_views(image, PINHOLE, MOUNTING, local, expected, None, OPTIONS)
+            assert isinstance(found, Localized)
+            off = (by @ next_one).local(found.world_from_body)
+            assert np.linalg.norm(off[:3]) < 0.1
+            assert np.linalg.norm(off[3:]) < 0.01
+            assert nees(off, found.covariance()) < 25.0
+
+    run(scenario())
+
+
 def test_where_no_local_map_can_be_made_it_flies_on_by_the_map() -> None:
     frames = asyncio.run(flown(np.random.default_rng(5), goes_on=True, shop=Failing))
     assert "odometry" not in {by(f) for f in frames}

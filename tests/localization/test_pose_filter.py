@@ -163,6 +163,21 @@ def test_a_jump_of_position_is_followed_and_counted(attitude: Array | None) -> N
     assert np.abs(moving.local(later.world_from_body)[:3]).max() < 0.02
 
 
+@pytest.mark.parametrize(("away_m", "off_m_s"), [(0.8, 1.6), (2.0, 4.0), (8.0, 10.0)])
+def test_after_a_jump_the_speed_is_known_the_less_the_farther_that_was(
+    away_m: float, off_m_s: float
+) -> None:
+    state = settled(np.eye(3))
+    before = np.sqrt(np.diag(state.covariance)[6:9])
+    there = Pose(np.eye(3), np.array([away_m, 0.0, 0.0]))
+    after = updated(predict(state, 15 * STEP_NS, np.eye(3), FilterOptions()), fix_at(there))
+    assert after.n_jumps == 1
+    sigma = np.sqrt(np.diag(after.covariance)[6:9])
+    assert before.max() < 0.5 < off_m_s
+    np.testing.assert_allclose(sigma, off_m_s, rtol=0.5)
+    assert np.abs(after.velocity_world).max() < 3.0 * before.max()
+
+
 def test_noise_is_neither_refused_nor_a_jump() -> None:
     rng = np.random.default_rng(7)
     flights = [filtered(fly(rng, 25, STEADY), noisy(rng), STEADY) for _ in range(20)]

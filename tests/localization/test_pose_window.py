@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.checks import assert_pose_close
 from vcl_companion.geometry.pose import Pose
-from vcl_companion.geometry.rotation import Array
+from vcl_companion.geometry.rotation import Array, exp_so3
 from vcl_companion.localization.fix import Localized
 from vcl_companion.localization.pose_window import PoseWindow
 from vcl_companion.mapping.view_adjustment import Placement
@@ -81,6 +82,28 @@ def test_a_later_map_errs_by_itself_as_far_as_anybody_knows() -> None:
     np.testing.assert_allclose(joint[:18, :18], before)
     assert not joint[18:, :18].any()
     np.testing.assert_allclose(joint[18:, 18:], LEVERS["c"] @ KEYS @ LEVERS["c"].T + NOISE + OWN)
+
+
+def test_who_was_elsewhere_takes_all_views_along() -> None:
+    moved, rng = window(), np.random.default_rng(6)
+    moved.poses = [Pose(exp_so3(rng.normal(size=3)), rng.normal(size=3)) for _ in moved.poses]
+    before, known = list(moved.poses), moved.covariance_of("abv")
+    by = Pose(exp_so3(np.array([0.1, -0.2, 0.7])), np.array([3.0, -1.0, 0.5]))
+    at, off = by @ before[1], spread(9, 6)
+    moved.displace(by, at, off)
+    for old, new in zip(before, moved.poses, strict=True):
+        assert_pose_close(by @ old, new, within_m=1e-12, within_rad=1e-12)
+    joint = moved.covariance_of("abv") - known
+    # What it was found at is off by that, the others with it: how they lie to it is as before.
+    np.testing.assert_allclose(joint[6:12, 6:12], off, atol=1e-12)
+    error = 1e-6 * rng.standard_normal(6)
+    shifted = at.retracted(error) @ at.inverse()
+    errors = np.concatenate([pose.local(shifted @ pose) for pose in moved.poses])
+    lever = joint[:, 6:12] @ np.linalg.inv(off)
+    np.testing.assert_allclose(lever @ error, errors, atol=1e-10)
+    moved.clear()
+    moved.displace(by, at, off)
+    assert moved.poses == []
 
 
 def test_what_is_dropped_leaves_the_others_as_they_are() -> None:

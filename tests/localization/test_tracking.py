@@ -120,6 +120,39 @@ def test_a_prediction_ten_pixels_off(
     assert_pose_close(fix.world_from_body, exact.world_from_body, within_m=0.01, within_rad=6e-4)
 
 
+_ANY_SPEED = np.diag(np.repeat([2.0, 0.01], 3) ** 2)
+
+
+def test_who_may_have_flown_far_is_found_near(
+    rng: np.random.Generator, templates: Templates
+) -> None:
+    """As after the first fix, when no speed is known, close to what is seen."""
+    image = photograph(TRUTH, rng)
+    start = TRUTH.retracted(np.array([0.6, -0.5, 0.3, 0.004, -0.006, 0.005]))
+    fix = tracked(image, templates, Prior(start, _ANY_SPEED))
+    assert_tracked(fix, TRUTH)
+    exact = tracked(image, templates, Prior(TRUTH, np.diag(_SIGMA**2)))
+    assert_pose_close(fix.world_from_body, exact.world_from_body, within_m=0.01, within_rad=6e-4)
+
+
+def test_of_what_is_seen_near_a_vague_prediction_most_has_to_be_there(
+    rng: np.random.Generator,
+) -> None:
+    landmark_map = painted_map(np.random.default_rng(3))
+    keyframes = [(k.world_from_body @ k.body_from_cam).translation for k in landmark_map.keyframes]
+    away = landmark_map.points_world - np.mean(keyframes, axis=0)
+    wrong = rng.uniform(size=len(away)) < 0.6
+    moved = away * np.where(wrong, 1.3, 1.0)[:, None] + np.mean(keyframes, axis=0)
+    bent = prepare_templates(
+        replace(landmark_map, points_world=moved), map_uncertainty(landmark_map)
+    )
+    image = photograph(TRUTH, rng)
+    sure = tracked(image, bent, Prior(TRUTH, np.diag(_SIGMA**2)))
+    assert OPTIONS.n_coarse / 10 < sure.n_inliers < 0.5 * sure.n_matched
+    why = reason(image, bent, Prior(TRUTH, _ANY_SPEED))
+    assert "of a prediction that is vague" in why or "agree" in why
+
+
 @pytest.mark.parametrize("gain", [0.5, 1.7])
 def test_other_light(rng: np.random.Generator, templates: Templates, gain: float) -> None:
     """A factor of two between keyframe and frame; at 1.7 the brightest places are white."""

@@ -226,7 +226,7 @@ async def _run(config: Config) -> int:
         camera,
         outcomes,
         own_fixes,
-        CatchingUp(exchange.frames, maps, estimator, own_fixes),
+        CatchingUp(config.system_id, exchange.frames, maps, estimator, own_fixes),
         PeerPoses(exchange.inter, maps, estimator, log),
         teller,
         maps,

@@ -125,6 +125,7 @@ class Companion:
         """Wait for a first map as long as no newer frame comes; answer the frame if none does."""
         await self._waits.first_map(frame)
         if self._maps.current is None:
+            self._own_fixes.take_nothing(frame, None)
             self._outcomes.refuse(frame, self._waits.no_map())
         return self._maps.current
 

@@ -228,6 +228,7 @@ class FrameAnswers:
             ValueError: the frame is over an hour old, or cannot be encoded.
         """
         at_ns = frame.captured_at_ns
+        self._choice.gave(frame)
         attitude = await self._autopilot.attitudes.at(at_ns, ATTITUDE_WAIT_S)
         detail = await self.detail(frame)
         state = self._estimator.own_fix_at(at_ns)

@@ -46,6 +46,10 @@ class FrameChoice:
         self._estimator = estimator
         self._clock = clock
 
+    def gave(self, frame: Frame) -> None:
+        """Note that a map may be made of a frame."""
+        self._frames.gave(frame)
+
     async def of(self, at_ns: int) -> Frame | None:
         """Return the frame nearest to an instant, or the last one before it that joins the map.
 

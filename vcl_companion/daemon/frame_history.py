@@ -23,13 +23,15 @@ FURTHEST_NS = 1_000_000_000
 class FrameHistory:
     """Keeps about the last two seconds, and of the ten before them one a second.
 
-    Of who is beyond the map five a second, since the last one that showed it well.
+    Of who is beyond the map five a second, since the last one that showed it well; of who has
+    none yet, since the last one that one may be made of.
     """
 
     def __init__(self) -> None:
         self._kept: deque[Frame] = deque(maxlen=_N_FRAMES)
         self._sparse: list[Frame] = []
         self._newest: Frame | None = None
+        self._given: Frame | None = None
 
     def add(self, frame: Frame, shown_at_ns: int | None = None) -> None:
         """Keep one more: always until the next one comes, longer unless frames come fast.
@@ -39,11 +41,17 @@ class FrameHistory:
             shown_at_ns: of the last frame that showed the map well; None where none did.
         """
         self._newest = frame
+        if shown_at_ns is None and self._given is not None:
+            shown_at_ns = self._given.captured_at_ns
         if self._kept and abs(frame.captured_at_ns - self._kept[-1].captured_at_ns) < _SPACING_NS:
             return
         if len(self._kept) == _N_FRAMES:
             self._thin_out(self._kept[0], shown_at_ns)
         self._kept.append(frame)
+
+    def gave(self, frame: Frame) -> None:
+        """Note which one a map may be made of: it is kept until the next one is."""
+        self._given = frame
 
     @property
     def newest(self) -> Frame | None:
@@ -66,9 +74,8 @@ class FrameHistory:
 
     def _all(self) -> list[Frame]:
         frames = [*self._sparse, *self._kept]
-        if self._newest is not None and self._newest is not frames[-1]:
-            frames.append(self._newest)
-        return frames
+        others = (frame for frame in (self._given, self._newest) if frame is not None)
+        return frames + [other for other in others if all(other is not f for f in frames)]
 
     def has(self, at_ns: int) -> bool:
         """Return whether the frame of an instant is here."""

@@ -24,6 +24,7 @@ class MapInSight:
         seen_on: revision of the map that the last frame was looked at on.
         beyond: revision of the map that was followed as far as it shows, the last frame being
             beyond that.
+        forgotten_until_ns: no frame up to this instant says any more where the drone is.
         sought_since_s: since when a frame is looked for by its features, by the loop's time;
             None where none is, or where the map was looked through in vain before.
     """
@@ -36,6 +37,7 @@ class MapInSight:
         self.shown_well_at_ns: int | None = None
         self.seen_on = b""
         self.beyond = b""
+        self.forgotten_until_ns = -1
         self.sought_since_s: float | None = None
         self._looked_at_ns = -1
         self._looked = asyncio.Event()
@@ -48,7 +50,7 @@ class MapInSight:
             self.tracked, self.covered = fix.n_seen, fix.covered
             self.novelty_deg = fix.novelty_deg
             self.note_shown(at_ns, fix)
-        self._looked_at_ns = at_ns
+        self._looked_at_ns = max(at_ns, self._looked_at_ns)
         self._looked.set()
 
     def note_shown(self, at_ns: int, fix: Localized) -> None:
@@ -60,6 +62,7 @@ class MapInSight:
     def forget_shown(self) -> None:
         """Note that what showed the map says nothing of where it shows anything now."""
         self.shown_at_ns = self.shown_well_at_ns = None
+        self.forgotten_until_ns = self._looked_at_ns
 
     def is_being_sought(self, now_s: float) -> bool:
         """Whether what the frames show will be known in a moment.

@@ -158,6 +158,20 @@ class Odometry:
         elif fix.is_on_map:
             self._local = None
 
+    def displaced(self, by: Pose, at: Pose, covariance: Array, world: tuple[bytes, int]) -> None:
+        """Go on from where we are in truth: how our own frames lie to each other holds as before.
+
+        Args:
+            by: what the belief was moved by, in the world.
+            at: where to.
+            covariance: (6, 6) local, of that.
+            world: the same world as before, begun in anew.
+        """
+        if world != (self._world[0], self._world[1] + 1):
+            return
+        self._window.displace(by, at, covariance)
+        self._world, self._local, self._begun_with = world, None, None
+
     async def run(self) -> None:
         """Make local maps, when they are wanted, until cancelled."""
         while True:

@@ -17,7 +17,7 @@ from vcl_companion.daemon.odometry import Odometry
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.localization.filter_state import FilterState
-from vcl_companion.localization.fix import Localized, NotLocalized
+from vcl_companion.localization.fix import Localized, NotLocalized, Prior
 from vcl_companion.localization.pipeline import (
     Effort,
     PipelineOptions,
@@ -158,8 +158,12 @@ class OwnFixes:
             return None
         return replace(on_map, fix=own, local=local)
 
-    async def look_by_patches(self, frame: Frame) -> Look | None:
+    async def look_by_patches(self, frame: Frame, prior: Prior | None = None) -> Look | None:
         """Look at a frame by patches alone, once.
+
+        Args:
+            frame: which.
+            prior: where it was taken; None: where the drone is believed to have been.
 
         Returns:
             What that gave; None without a map that has some, or where its world was left meanwhile,
@@ -170,7 +174,7 @@ class OwnFixes:
             return None
         ned_from_body = await self._attitude_of(frame)
         now_s, n_forgotten = asyncio.get_running_loop().time(), self._estimator.n_forgotten
-        fix = await self._localized(frame, stored, ned_from_body, _PATCHES_ALONE)
+        fix = await self._localized(frame, stored, ned_from_body, _PATCHES_ALONE, prior)
         if not self._still_counts(stored, n_forgotten):
             return None
         return Look(stored, ned_from_body, fix, now_s)
@@ -180,10 +184,17 @@ class OwnFixes:
         return None if attitude is None else attitude.ned_from_body
 
     async def _localized(
-        self, frame: Frame, stored: StoredMap, ned_from_body: Array | None, effort: Effort
+        self,
+        frame: Frame,
+        stored: StoredMap,
+        ned_from_body: Array | None,
+        effort: Effort,
+        prior: Prior | None = None,
     ) -> Localized | NotLocalized:
-        """Return what a frame gives from where the drone is believed to have been then."""
+        """Return what a frame gives from a pose, or from where the drone is believed to be then."""
         predicted = self._estimator.predicted(frame.captured_at_ns, ned_from_body)
+        if prior is None and predicted is not None:
+            prior = predicted.prior()
         return await self._looked(
             localize,
             frame.image,
@@ -191,7 +202,7 @@ class OwnFixes:
             self._sensor.body_from_cam,
             stored.index,
             stored.templates,
-            predicted.prior() if predicted else None,
+            prior,
             ned_from_body,
             self._options,
             replace(effort, has_heading=self._estimator.has_heading),
@@ -221,7 +232,11 @@ class OwnFixes:
         at_ns = frame.captured_at_ns
         # Again, not as it was before the vision: a proposal may have come meanwhile.
         predicted = self._estimator.predicted(at_ns, ned_from_body)
+        n_displaced = self._estimator.n_displaced
         state = self._estimator.take_fix(predicted, fix, at_ns, ned_from_body)
+        is_displaced = self._estimator.n_displaced > n_displaced
+        if is_displaced and predicted is not None and isinstance(state, FilterState):
+            self._displaced(predicted, state)
         refused = state if isinstance(state, NotLocalized) else None
         self._log.estimate(
             at_ns,
@@ -231,6 +246,13 @@ class OwnFixes:
             reason=refused.reason if refused else "",
         )
         return state
+
+    def _displaced(self, believed: FilterState, state: FilterState) -> None:
+        """Have our own frames' poses go along from where we were believed to be."""
+        stored, at = self._maps.current, state.world_from_body
+        if stored is not None:
+            by = at @ believed.world_from_body.inverse()
+            self._odometry.displaced(by, at, state.pose_covariance(), self._world_of(stored))
 
     def take_nothing(self, frame: Frame, ned_from_body: Array | None) -> None:
         """Bring the state up to a frame that gave no fix."""

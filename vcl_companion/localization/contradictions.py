@@ -1,7 +1,8 @@
 """What is believed where a fix contradicts the prediction: the fix, the attitude, or neither.
 
 A fix whose position the covariances cannot explain (a relocalization, a
-prediction gone wrong) replaces position and speed and counts as a jump. One
+prediction gone wrong) replaces the position and counts as a jump; the farther that
+was, the less is known of the speed. One
 whose rotation contradicts the autopilot's turn since the last fix is wrong:
 repeated structure, a planar twin; but for a few degrees at the place where the drone was
 expected, or more where nearly all of the map's patches agree: these are the
@@ -35,6 +36,8 @@ _MOST_TURNED_RAD, _MOST_TURNED_SEEN_RAD = np.deg2rad(6.0), np.deg2rad(20.0)
 _SEEN_PATCHES, _SEEN_SHARE = 200, 0.8
 # What is known after a jump, 1 sigma: nothing.
 _FORGOTTEN_M, _FORGOTTEN_M_S, _FORGOTTEN_RAD = 1e3, 10.0, np.pi
+# What made a jump went on for so long.
+_JUMPED_WITHIN_S = 0.5
 
 
 def reconciled(
@@ -67,7 +70,7 @@ def reconciled(
         predicted = _doubting_attitude(predicted, turned_rad)
         expected = measured.expected_by(predicted.covariance)
     if innovation @ np.linalg.solve(expected, innovation) > GATE_POSE:
-        return _forgotten(predicted)
+        return _forgotten(predicted, float(np.linalg.norm(innovation[:3])))
     return predicted
 
 
@@ -84,14 +87,20 @@ def _doubting_attitude(state: FilterState, turned_rad: float) -> FilterState:
     return replace(state, covariance=covariance)
 
 
-def _forgotten(state: FilterState) -> FilterState:
-    """Return the state that knows nothing of where it is; with an autopilot, how it is turned."""
-    forgotten = [(POSITION, _FORGOTTEN_M), (VELOCITY, _FORGOTTEN_M_S)]
+def _forgotten(state: FilterState, jump_m: float) -> FilterState:
+    """Return the state that knows nothing of where it is; with an autopilot, how it is turned.
+
+    Who was not where it was believed to be did not fly as believed either, the less the farther.
+    """
+    forgotten = [(POSITION, _FORGOTTEN_M)]
     if state.ned_from_body is None:
         forgotten.append((OFFSET, _FORGOTTEN_RAD))
-    return replace(
-        state,
-        covariance=unknown(state.covariance, forgotten),
-        velocity_world=np.zeros(3),
-        n_jumps=state.n_jumps + 1,
-    )
+    off_m_s = jump_m / _JUMPED_WITHIN_S
+    velocity = state.velocity_world
+    if off_m_s >= _FORGOTTEN_M_S:
+        forgotten.append((VELOCITY, _FORGOTTEN_M_S))
+        velocity = np.zeros(3)
+    covariance = unknown(state.covariance, forgotten)
+    if off_m_s < _FORGOTTEN_M_S:
+        covariance[VELOCITY, VELOCITY] += off_m_s**2 * np.eye(3)
+    return replace(state, covariance=covariance, velocity_world=velocity, n_jumps=state.n_jumps + 1)

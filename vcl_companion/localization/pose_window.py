@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from vcl_companion.geometry.pose import Pose
+from vcl_companion.geometry.pose import Pose, adjoint
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.localization.fix import Localized
 from vcl_companion.mapping.view_adjustment import Placement
@@ -113,6 +113,20 @@ class PoseWindow(Generic[_View]):
         self._covariance = joint[np.ix_(rows, rows)]
         self.views = [views[k] for k in order]
         self.poses = [placement.bodies[k] for k in order]
+
+    def displace(self, by: Pose, at: Pose, covariance: Array) -> None:
+        """Move all views together: one of them, or what lies between, was elsewhere than believed.
+
+        Args:
+            by: what their poses are moved by, in the world.
+            at: where that one was in truth.
+            covariance: (6, 6) local, of that: what all are off by from now on, whatever they were.
+        """
+        n = 6 * len(self.views)
+        self.poses = [by @ pose for pose in self.poses]
+        if n:
+            lever = np.concatenate([adjoint(pose.inverse() @ at) for pose in self.poses])
+            self._covariance[:n, :n] += lever @ covariance @ lever.T
 
     def drop(self, index: int) -> None:
         """Drop a view."""

@@ -39,6 +39,11 @@ _SINGULAR = 1e-9
 _MAX_ROUNDS = 3
 # Patches warped and begun so near to where they are need no second look.
 _WELL_PREDICTED_PX = 0.5
+# Of the largest radius: what is looked for there leaves some for how the drone may be turned.
+_NEARER = 0.9
+# A prediction that is off by so many widths of the image is none; of one that is off by more than
+# the largest radius this share of the patches has to be found.
+_FARTHEST, _MOST_OF_THEM = 4.0, 0.5
 # Patches that lie so far from where they are in their keyframes are shifted as much as any;
 # half as far, half as much.
 _SHIFTED_WHOLLY_PX = 40.0
@@ -51,7 +56,8 @@ class TrackingOptions:
     Attributes:
         n_landmarks: patches aligned at full resolution.
         n_coarse: of these, how many find the way when the prediction is poor.
-        max_radius_px: a prediction less certain than this, 3 sigma, is no prediction.
+        max_radius_px: no patch is looked for farther than this, 3 sigma, from where it is expected;
+            of a vaguer prediction most of them have to be there.
         least_score: correlation of an aligned patch, at least.
         coarse_score: the same at reduced resolution.
         grey_noise: of an image, grey levels, 1 sigma.
@@ -148,6 +154,12 @@ def track(
     return tracker.located(prior, ned_from_body)
 
 
+def _radius_of(radii: Array) -> float:
+    """Return how far landmarks may be from where they are expected: three quarters are nearer."""
+    at = (3 * len(radii)) // 4
+    return float(np.partition(radii, at)[at]) if len(radii) else 0.0
+
+
 class _Tracker:
     """One image against one map."""
 
@@ -177,11 +189,17 @@ class _Tracker:
         options = self._options
         pose = prior.world_from_body
         rows, radii, in_view = self._choose(prior)
+        radius, least = _radius_of(radii), 0.0
+        if options.max_radius_px < radius <= _FARTHEST * self._camera.width_px:
+            # Hardly anybody flies as fast as one may: what is near is looked at, and most of it
+            # has to be there.
+            least = _MOST_OF_THEM
+            slower = np.diag([_NEARER * options.max_radius_px / radius] * 3 + [1.0] * 3)
+            prior = Prior(pose, slower @ prior.covariance @ slower)
+            rows, radii, in_view = self._choose(prior)
+            radius = _radius_of(radii)
         if len(rows) < self._belief.min_inliers:
             return NotLocalized(f"{len(rows)} landmarks in view, {self._belief.min_inliers} needed")
-        # Three quarters of them are nearer.
-        at = (3 * len(radii)) // 4
-        radius = float(np.partition(radii, at)[at])
         if radius > options.max_radius_px:
             return NotLocalized(f"the prediction is {radius:.0f} px uncertain")
         if radius > 1.5:
@@ -207,7 +225,12 @@ class _Tracker:
             found, refined = looks[best], rivals[best]
         elif self._is_ill_predicted(found):
             found = self._aligned(rows, refined, np.zeros(len(rows)), 0, options.least_score)
-        return self._judged(found, refined, len(rows), in_view, ned_from_body)
+        fix = self._judged(found, refined, len(rows), in_view, ned_from_body)
+        if isinstance(fix, Localized) and fix.n_inliers < least * fix.n_matched:
+            n, n_tried = fix.n_inliers, fix.n_matched
+            why = f"{n} of {n_tried} patches agree on a pose, of a prediction that is vague"
+            return NotLocalized(why, n_tried, n)
+        return fix
 
     @staticmethod
     def _is_ill_predicted(found: Alignment) -> bool:
