@@ -116,6 +116,8 @@ def stand_in_config(plan: FlightPlan, planned: PlannedDrone, out: Path) -> dict[
         "boot_offset_ns": plan.starts_at_ns - booted_before_ns,
         **flies,
         **_firmware_config(plan, out / "run" / planned.name / "firmware"),
+        # Whose daemon is killed is in the air, where the next one goes on with its map.
+        "arms": any(a.drone == planned.name and not a.is_late for a in plan.options.absences),
         # An autopilot has a processor of its own.
         "realtime": not math.isinf(plan.options.speed),
         "out": str(out / planned.name),

@@ -8,7 +8,8 @@ recording's time stands still.
 Configuration: ``system_id``, ``boot_offset_ns`` (its boot clock is recording time minus
 this), ``attitude`` {``source`` "truth" or "replay", ``file``, and for truth ``seed``,
 ``tilt_bias_deg``, ``heading_bias_deg``, ``white_deg``, ``rate_hz``}, ``parameters`` (name to
-value, those that are not as they should be; may be absent), ``out`` (directory for
+value, those that are not as they should be; may be absent), ``arms`` (whether it is armed from its
+first position on; may be absent), ``out`` (directory for
 ``attitude.csv`` and ``received.jsonl``). It takes no encoding from the companion:
 what it decodes is a second opinion.
 """
@@ -84,6 +85,8 @@ class StandInOptions:
         out: directory for what it writes.
         parameters: of its own, by name, besides those that fly on our poses.
         realtime: whether it goes before other programs on this machine, where that is permitted.
+        arms: whether it is armed from its first position on. Not by itself: between photographs
+            nobody flies, and of an armed one's jumps five a minute are followed.
     """
 
     system_id: int
@@ -92,6 +95,7 @@ class StandInOptions:
     out: Path
     realtime: bool = False
     parameters: Mapping[str, float] = field(default_factory=dict)
+    arms: bool = False
 
 
 def read_options(path: Path) -> StandInOptions:
@@ -123,6 +127,7 @@ def read_options(path: Path) -> StandInOptions:
             Path(config["out"]),
             bool(config.get("realtime", False)),
             {str(name): float(value) for name, value in config.get("parameters", {}).items()},
+            bool(config.get("arms", False)),
         )
     except KeyError as error:
         raise ConfigError(f"{path}: key {error} is missing") from error
@@ -210,13 +215,13 @@ class StandIn:
 
     def _beat(self) -> None:
         # Without a position ArduCopter is not armed in GUIDED; in the air it stays so without one.
-        has_had_position = self._fusing.at(self._now_ns or 0) is not None
-        armed = dialect.MAV_MODE_FLAG_SAFETY_ARMED if has_had_position else 0
+        is_armed = self._options.arms and self._fusing.at(self._now_ns or 0) is not None
         self._send(
             dialect.MAVLink_heartbeat_message(
                 dialect.MAV_TYPE_QUADROTOR,
                 dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
-                dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | armed,
+                dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+                | (dialect.MAV_MODE_FLAG_SAFETY_ARMED if is_armed else 0),
                 4,  # ArduCopter's GUIDED
                 dialect.MAV_STATE_ACTIVE,
                 3,

@@ -36,6 +36,7 @@ from vcl_companion.geometry.rotation import (
 from vcl_companion.links.autopilot import AutopilotLink
 from vcl_companion.links.autopilot_options import AutopilotOptions, ServiceState
 from vcl_companion.links.texts import Severity
+from vcl_companion.links.vehicle_mode import VehicleMode
 from vcl_companion.links.vision_pose import PoseEstimate
 
 REPOSITORY = Path(__file__).parents[2]
@@ -98,12 +99,15 @@ async def start(*arguments: str) -> asyncio.subprocess.Process:
 
 
 @contextlib.asynccontextmanager
-async def stand_in(out: Path, attitude: dict[str, object]) -> AsyncIterator[StandInProcess]:
+async def stand_in(
+    out: Path, attitude: dict[str, object], *, arms: bool = False
+) -> AsyncIterator[StandInProcess]:
     config = out.with_suffix(".json")
     settings = {
         "system_id": SYSTEM,
         "boot_offset_ns": BOOT_OFFSET_NS,
         "attitude": attitude,
+        "arms": arms,
         "out": str(out),
     }
     config.write_text(json.dumps(settings))
@@ -234,11 +238,12 @@ def test_it_knows_no_north_until_it_is_told_poses(tmp_path: Path) -> None:
     np.testing.assert_allclose(after, 1.2, atol=1e-3)
 
 
-def test_it_is_armed_from_its_first_position_on(tmp_path: Path) -> None:
+@pytest.mark.parametrize("arms", [True, False])
+def test_it_may_be_armed_from_its_first_position_on(tmp_path: Path, arms: bool) -> None:
     clock = ManualClock(START_NS)
 
     async def scenario() -> None:
-        async with stand_in(tmp_path / "mav", truth(tmp_path)) as process:
+        async with stand_in(tmp_path / "mav", truth(tmp_path), arms=arms) as process:
             await process.advance_to(START_NS)
             link = link_to(process.port, clock)
             async with running(link.run()):
@@ -249,7 +254,12 @@ def test_it_is_armed_from_its_first_position_on(tmp_path: Path) -> None:
                     Pose.identity(), np.eye(6), np.zeros(3), np.eye(3), START_NS, 0
                 )
                 assert link.poses.send(still) is None
-                await until(lambda: link.mode.is_steered_by_positions)
+                await until(lambda: bool(received(tmp_path / "mav", "VISION_POSITION_ESTIMATE")))
+                if arms:
+                    await until(lambda: link.mode.is_steered_by_positions)
+                else:
+                    link._mode = VehicleMode(is_armed=True)
+                    await until(lambda: not link.mode.is_armed)
             await process.finish()
 
     asyncio.run(scenario())
