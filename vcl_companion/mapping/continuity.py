@@ -95,7 +95,7 @@ def pruned(landmark_map: LandmarkMap, n_old: int, options: MapOptions) -> Landma
         order = np.argsort(-landmark_map.seen.sum(axis=1), kind="stable")
         keep = np.zeros(len(order), dtype=bool)
         keep[order[: options.max_landmarks]] = True
-        landmark_map = _of(landmark_map, keep)
+        landmark_map = landmark_map.of_landmarks(keep)
     return landmark_map
 
 
@@ -210,12 +210,4 @@ def _without(landmark_map: LandmarkMap, k: int) -> LandmarkMap:
             if k not in (d.keyframe_a, d.keyframe_b)
         ),
     )
-    return _of(shorter, shorter.seen.sum(axis=1) >= 2)
-
-
-def _of(landmark_map: LandmarkMap, keep: Mask) -> LandmarkMap:
-    return replace(
-        landmark_map,
-        points_world=landmark_map.points_world[keep],
-        observed_px=landmark_map.observed_px[keep],
-    )
+    return shorter.of_landmarks(shorter.seen.sum(axis=1) >= 2)

@@ -7,9 +7,10 @@ it follows from the geometry (``map_uncertainty``).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
@@ -146,6 +147,12 @@ class LandmarkMap:
     def world_of(self, revision: bytes) -> bytes:
         """Return the name of the world that the map is in, given its own revision."""
         return self.world or revision
+
+    def of_landmarks(self, some: slice | NDArray[np.bool_] | NDArray[np.intp]) -> LandmarkMap:
+        """Return the same map with some of its landmarks alone."""
+        return replace(
+            self, points_world=self.points_world[some], observed_px=self.observed_px[some]
+        )
 
     @property
     def n_pixels(self) -> int:

@@ -6,8 +6,6 @@ to certainty, not accuracy.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,11 +35,7 @@ def thinned(landmark_map: LandmarkMap, per_cell: int) -> LandmarkMap:
     """Keep landmarks, those seen most often first, that some keyframe's cell has room for."""
     cameras = [k.camera for k in landmark_map.keyframes]
     kept = spread(landmark_map.observed_px, cameras, per_cell)
-    return replace(
-        landmark_map,
-        points_world=landmark_map.points_world[kept],
-        observed_px=landmark_map.observed_px[kept],
-    )
+    return landmark_map.of_landmarks(kept)
 
 
 def spread(observed_px: Array, cameras: list[Camera], per_cell: int) -> Index:

@@ -13,7 +13,7 @@ it is itself; that is left out.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,14 +147,14 @@ def map_uncertainty(landmark_map: LandmarkMap, calibration_px: float = 0.0) -> M
     # In the order in which compiled loops were compiled for it. It is the largest part of a
     # map of many keyframes, and a millionth of it is no matter.
     lever = np.zeros((n, 3, 6 * n_keyframes), dtype=np.float32)
-    reduced = distance_information(views_of(_of(landmark_map, slice(0, 0))))
+    reduced = distance_information(views_of(landmark_map.of_landmarks(slice(0, 0))))
     n_causes = N_FIELDS + (n_lens_causes(landmark_map) if calibration_px else 0)
     pulls = np.zeros((6 * n_keyframes, n_causes))
     bodies = matrices_of([k.world_from_body for k in landmark_map.keyframes])
     mountings = matrices_of([k.body_from_cam for k in landmark_map.keyframes])
     with np.errstate(all="ignore"):
         for some in _portions(n):
-            part = _of(landmark_map, some)
+            part = landmark_map.of_landmarks(some)
             seen, views = part.seen, views_of(part)
             first, view = observations_of(seen)
             noise_px, errors_px = misplacement(part)
@@ -188,15 +188,6 @@ def map_uncertainty(landmark_map: LandmarkMap, calibration_px: float = 0.0) -> M
     if not np.all(np.isfinite(covariance)):
         raise ValueError("the map's observations do not fix it")
     return MapUncertainty(covariance, inverse, lever, calibration_px)
-
-
-def _of(landmark_map: LandmarkMap, some: slice) -> LandmarkMap:
-    """Return a map of some of its landmarks."""
-    return replace(
-        landmark_map,
-        points_world=landmark_map.points_world[some],
-        observed_px=landmark_map.observed_px[some],
-    )
 
 
 def _inverse(information: Array) -> Array:

@@ -82,8 +82,9 @@ def leverages(
 
 @compiled
 def _without(slopes: Array, spread: Array) -> None:
-    """Take out of a (n, n) covariance, in place, what goes along (n, 3) slopes; spoils these."""
+    """Take out of an (n, n) covariance what goes along (n, 3) slopes, in place; spoils these."""
     n = len(slopes)
+    along = np.empty(n)
     for c in range(3):
         before = 0.0
         for k in range(n):
@@ -91,11 +92,11 @@ def _without(slopes: Array, spread: Array) -> None:
         # Twice, or rounding leaves them not at right angles (Gram-Schmidt).
         for _ in range(2):
             for d in range(c):
-                along = 0.0
+                shared = 0.0
                 for k in range(n):
-                    along += slopes[k, c] * slopes[k, d]
+                    shared += slopes[k, c] * slopes[k, d]
                 for k in range(n):
-                    slopes[k, c] -= along * slopes[k, d]
+                    slopes[k, c] -= shared * slopes[k, d]
         length = 0.0
         for k in range(n):
             length += slopes[k, c] ** 2
@@ -104,18 +105,19 @@ def _without(slopes: Array, spread: Array) -> None:
             continue
         slopes[:, c] /= np.sqrt(length)
         # As a product from both sides with what is left without this direction.
+        both = 0.0
         for r in range(n):
-            along = 0.0
+            along[r] = 0.0
             for k in range(n):
-                along += spread[r, k] * slopes[k, c]
-            for k in range(n):
-                spread[r, k] -= along * slopes[k, c]
+                along[r] += spread[r, k] * slopes[k, c]
+            both += along[r] * slopes[r, c]
         for r in range(n):
-            along = 0.0
             for k in range(n):
-                along += spread[k, r] * slopes[k, c]
-            for k in range(n):
-                spread[k, r] -= along * slopes[k, c]
+                spread[r, k] -= (
+                    along[r] * slopes[k, c]
+                    + slopes[r, c] * along[k]
+                    - both * slopes[r, c] * slopes[k, c]
+                )
 
 
 @compiled
