@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -83,6 +84,9 @@ def test_who_had_no_fix_yet_goes_on_from_its_keyframe_where_no_features_are(
                 off = demo.world_from_body(DRONE, k).local(state.world_from_body)
                 assert np.linalg.norm(off[:3]) < 0.05
             assert up.autopilot.poses.qsize() == 1  # of the newest
+            lines = map(json.loads, up.path.read_text().splitlines())
+            told = [line["captured_at_ns"] for line in lines if line["kind"] == "estimate"]
+            assert sorted(set(told)) == sorted(told)  # each counts once
 
     run(scenario())
 

@@ -228,8 +228,14 @@ class OwnFixes:
     def take(
         self, frame: Frame, fix: Localized, ned_from_body: Array | None
     ) -> FilterState | NotLocalized:
-        """Bring the state up to a frame's fix; or say why that is not believed."""
+        """Bring the state up to a frame's fix; or say why that is not believed.
+
+        What a frame shows of the map counts once: one that waited for it may have been followed.
+        """
         at_ns = frame.captured_at_ns
+        known = self._estimator.own_fix_at(at_ns)
+        if known is not None and fix.is_on_map:
+            return known
         # Again, not as it was before the vision: a proposal may have come meanwhile.
         predicted = self._estimator.predicted(at_ns, ned_from_body)
         n_displaced = self._estimator.n_displaced

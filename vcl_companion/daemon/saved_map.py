@@ -22,6 +22,7 @@ from vcl_companion.links.texts import Severity
 
 _log = logging.getLogger(__name__)
 
+# A heartbeat of the autopilot has come by then, if there is one to come; looked for so often.
 _HEARD_S, _LOOK_S = 3.0, 0.02
 
 

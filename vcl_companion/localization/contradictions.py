@@ -1,9 +1,8 @@
 """What is believed where a fix contradicts the prediction: the fix, the attitude, or neither.
 
-A fix whose position the covariances cannot explain (a relocalization, a
-prediction gone wrong) replaces the position and counts as a jump; the farther that
-was, the less is known of the speed. One
-whose rotation contradicts the autopilot's turn since the last fix is wrong:
+A fix whose position the covariances cannot explain (a relocalization, a prediction gone
+wrong) replaces the position and counts as a jump; the farther that was, the less is known
+of the speed. One whose rotation contradicts the autopilot's turn since the last fix is wrong:
 repeated structure, a planar twin; but for a few degrees at the place where the drone was
 expected, or more where nearly all of the map's patches agree: these are the
 autopilot's own. Where it sends no attitude, a jump replaces the rotation as well.
@@ -96,11 +95,10 @@ def _forgotten(state: FilterState, jump_m: float) -> FilterState:
     if state.ned_from_body is None:
         forgotten.append((OFFSET, _FORGOTTEN_RAD))
     off_m_s = jump_m / _JUMPED_WITHIN_S
-    velocity = state.velocity_world
-    if off_m_s >= _FORGOTTEN_M_S:
-        forgotten.append((VELOCITY, _FORGOTTEN_M_S))
-        velocity = np.zeros(3)
-    covariance = unknown(state.covariance, forgotten)
     if off_m_s < _FORGOTTEN_M_S:
+        velocity, covariance = state.velocity_world, unknown(state.covariance, forgotten)
         covariance[VELOCITY, VELOCITY] += off_m_s**2 * np.eye(3)
+    else:
+        forgotten.append((VELOCITY, _FORGOTTEN_M_S))
+        velocity, covariance = np.zeros(3), unknown(state.covariance, forgotten)
     return replace(state, covariance=covariance, velocity_world=velocity, n_jumps=state.n_jumps + 1)
