@@ -141,8 +141,6 @@ class CatchingUp:
         """
         at_ns = frame.captured_at_ns
         look = await self._own_fixes.look_by_patches(frame, prior)
-        # It may have been looked for all over the map meanwhile.
-        is_open = self._estimator.own_fix_at(at_ns) is None
-        if is_open and look is not None and isinstance(look.fix, Localized):
+        if look is not None and isinstance(look.fix, Localized):
             self._own_fixes.take(frame, look.fix, look.ned_from_body)
         return self._estimator.own_fix_at(at_ns) is not None

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -90,7 +89,7 @@ async def set_parameters(
         ConfigError: no autopilot is heard.
     """
     async with _linked(config, SystemClock()) as link:
-        if not await _heard_of(link):
+        if not await link.heard(_HEARTBEAT_S):
             raise ConfigError(
                 f"no heartbeat of an autopilot over {config.autopilot.link}: nothing is changed"
             )
@@ -132,14 +131,6 @@ async def _linked(config: Config, clock: Clock) -> AsyncIterator[AutopilotLink]:
             await running
 
 
-async def _heard_of(link: AutopilotLink) -> bool:
-    """Wait for the autopilot's first heartbeat; whether it came."""
-    deadline_s = time.monotonic() + _HEARTBEAT_S
-    while not link.has_been_heard and time.monotonic() < deadline_s:
-        await asyncio.sleep(0.1)
-    return link.has_been_heard
-
-
 async def _of_axes(
     config: Config, link: AutopilotLink, clock: Clock, tilt: Callable[[], None]
 ) -> list[Check]:
@@ -159,7 +150,7 @@ async def _of_axes(
 
 async def of_autopilot(config: Config, link: AutopilotLink) -> tuple[list[Check], list[Finding]]:
     """Look at what the autopilot behind a running link says of itself."""
-    if not await _heard_of(link):
+    if not await link.heard(_HEARTBEAT_S):
         advice = f"is it on, and autopilot.link right ({config.autopilot.link})? its system_id?"
         what = f"no heartbeat of system {config.system_id} in {_HEARTBEAT_S:.0f} s"
         return [Check("autopilot", "failure", what, advice)], []

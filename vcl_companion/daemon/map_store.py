@@ -191,9 +191,9 @@ class MapStore:
         leaves no half map. A disk that is full must not end the flight: the
         failure is logged. Nor must maps fill it: the oldest have to go.
         """
-        path = self._file_of(stored.revision)
-        if self._directory is None or path is None:
+        if self._directory is None:
             return
+        path = self._directory / _file_of(stored.revision)
         try:
             write_whole(path, stored.data)
             self._written[path] = len(self._written)
@@ -212,10 +212,7 @@ class MapStore:
         Raises:
             OSError: it cannot be read; FileNotFoundError: it was not kept, or is not any more.
         """
-        return _read(self._file_of(revision))
-
-    def _file_of(self, revision: bytes) -> Path | None:
-        return self._directory and self._directory / f"{revision.hex()}.vclmap"
+        return _read(self._directory and self._directory / _file_of(revision))
 
     @property
     def saved_file(self) -> Path | None:
@@ -247,6 +244,10 @@ class MapStore:
         """
         if self.saved_file is not None:
             self.saved_file.unlink(missing_ok=True)
+
+
+def _file_of(revision: bytes) -> str:
+    return f"{revision.hex()}.vclmap"
 
 
 def _read(path: Path | None) -> bytes:

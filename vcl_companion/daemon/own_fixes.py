@@ -230,7 +230,8 @@ class OwnFixes:
     ) -> FilterState | NotLocalized:
         """Bring the state up to a frame's fix; or say why that is not believed.
 
-        What a frame shows of the map counts once: one that waited for it may have been followed.
+        What a frame shows of the map counts once: one that waited for it may have been followed,
+        one that is followed may have been looked for all over the map meanwhile.
         """
         at_ns = frame.captured_at_ns
         known = self._estimator.own_fix_at(at_ns)

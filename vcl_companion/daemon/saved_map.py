@@ -11,7 +11,6 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable
 from concurrent.futures import Executor
-from contextlib import suppress
 
 from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import FlightLog
@@ -22,8 +21,8 @@ from vcl_companion.links.texts import Severity
 
 _log = logging.getLogger(__name__)
 
-# A heartbeat of the autopilot has come by then, if there is one to come; looked for so often.
-_HEARD_S, _LOOK_S = 3.0, 0.02
+# A heartbeat of the autopilot has come by then, if there is one to come.
+_HEARD_S = 3.0
 
 
 class SavedMap:
@@ -101,20 +100,13 @@ class SavedMap:
     async def _goes_on(self) -> bool:
         """Go on with the map that the last service died on; whether we do."""
         data = await self._on_disk(self._in_flight.left_behind)
-        if not data or not await self._is_in_the_air():
+        # Armed is in the air; its heartbeats say so, one a second.
+        if not (data and await self._autopilot.heard(_HEARD_S) and self._autopilot.mode.is_armed):
             return False
         refused = await self._go_back_to(data)
         if refused:
             return self._failed("map of before not taken", refused)
         return self._done("goes on with the map of before")
-
-    async def _is_in_the_air(self) -> bool:
-        """Whether the autopilot is armed, as its next heartbeat says: it has one a second."""
-        with suppress(TimeoutError):
-            async with asyncio.timeout(_HEARD_S):
-                while not self._autopilot.has_been_heard:
-                    await asyncio.sleep(_LOOK_S)
-        return self._autopilot.mode.is_armed
 
     async def _taken(self) -> str | None:
         """Fly on it; return why it cannot be used, or nothing; None where there is none."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -53,6 +54,8 @@ from vcl_companion.links.vision_pose import Firmware, firmware_of
 _log = logging.getLogger(__name__)
 
 _HEARTBEAT_S = 1.0
+# So often it is looked whether a first one of the autopilot's has come.
+_LOOK_S = 0.02
 # Whole heartbeats of ours in which an autopilot's would have come.
 _SILENT_S = 10.0
 _FIRMWARE = {"ardupilot": Firmware.ARDUPILOT, "px4": Firmware.PX4}
@@ -155,6 +158,14 @@ class AutopilotLink:
     def send(self, message: Any) -> None:
         """Send one of ``own_messages``."""
         self._transport.write(self._codec.frame(message))
+
+    async def heard(self, within_s: float) -> bool:
+        """Wait for a first heartbeat of it; return whether one has come by then."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                while not self.has_been_heard:
+                    await asyncio.sleep(_LOOK_S)
+        return self.has_been_heard
 
     @property
     def is_heard(self) -> bool:

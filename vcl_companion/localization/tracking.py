@@ -189,11 +189,10 @@ class _Tracker:
         options = self._options
         pose = prior.world_from_body
         rows, radii, in_view = self._choose(prior)
-        radius, least = _radius_of(radii), 0.0
-        if options.max_radius_px < radius <= _FARTHEST * self._camera.width_px:
-            # Hardly anybody flies as fast as one may: what is near is looked at, and most of it
-            # has to be there.
-            least = _MOST_OF_THEM
+        radius = _radius_of(radii)
+        is_vague = options.max_radius_px < radius <= _FARTHEST * self._camera.width_px
+        if is_vague:
+            # Hardly anybody flies as fast as one may: what is near is looked at.
             slower = np.diag([_NEARER * options.max_radius_px / radius] * 3 + [1.0] * 3)
             prior = Prior(pose, slower @ prior.covariance @ slower)
             rows, radii, in_view = self._choose(prior)
@@ -226,10 +225,11 @@ class _Tracker:
         elif self._is_ill_predicted(found):
             found = self._aligned(rows, refined, np.zeros(len(rows)), 0, options.least_score)
         fix = self._judged(found, refined, len(rows), in_view, ned_from_body)
-        if isinstance(fix, Localized) and fix.n_inliers < least * fix.n_matched:
+        if is_vague and isinstance(fix, Localized):
             n, n_tried = fix.n_inliers, fix.n_matched
-            why = f"{n} of {n_tried} patches agree on a pose, of a prediction that is vague"
-            return NotLocalized(why, n_tried, n)
+            if n < _MOST_OF_THEM * n_tried:
+                why = f"{n} of {n_tried} patches agree on a pose, of a prediction that is vague"
+                return NotLocalized(why, n_tried, n)
         return fix
 
     @staticmethod

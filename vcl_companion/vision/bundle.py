@@ -18,7 +18,7 @@ from vcl_companion.compiled import writable
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, skew
 from vcl_companion.vision import bundle_kernels as kernels
-from vcl_companion.vision.leverage_kernels import leverages as of_landmarks
+from vcl_companion.vision import leverage_kernels
 
 _MIN_DEPTH_M = 1e-3
 # By so many pixels no weight falls.
@@ -144,7 +144,7 @@ def leverages(views: Views, covariance: Array) -> Array:
         views: an estimate.
         covariance: (6V, 6V) of the poses, for 1 px of noise, zero for the held ones.
     """
-    return of_landmarks(*_Problem(views, 1.0).arguments(views), covariance)
+    return leverage_kernels.leverages(*_Problem(views, 1.0).arguments(views), covariance)
 
 
 def relative_sigmas(views: Views) -> Array:
