@@ -271,22 +271,29 @@ def test_frames_of_another_world_begin_nothing() -> None:
 
 
 @pytest.mark.parametrize("n_jumps", [1, 2])
-def test_who_was_elsewhere_goes_on_by_own_frames_from_there(n_jumps: int) -> None:
+@pytest.mark.parametrize("own_frames", [0, 3])
+def test_who_was_elsewhere_goes_on_by_own_frames_from_there(n_jumps: int, own_frames: int) -> None:
+    """Where own frames had led it; where the map had put it, it was, and flew as nobody thought."""
+
     async def scenario() -> None:
         _, templates = chart()
         by = Pose(exp_so3(np.array([0.0, 0.0, 0.1])), np.array([2.0, -3.0, 0.4]))
         small = np.diag(np.repeat([0.01, 0.001], 3) ** 2)
         async with making() as odometry:
-            for k in range(5):
+            for k in range(5 + own_frames):
                 truth = truth_at(1.0 + 0.3 * k)
                 image = photograph(truth, np.random.default_rng(k))
-                fix = follow(
-                    image, PINHOLE, MOUNTING, templates, Prior(truth, small), None, OPTIONS
-                )
+                where = Prior(truth, small)
+                local = odometry.templates if k >= 5 else None
+                look, seen = (follow, templates) if local is None else (follow_own_views, local)
+                fix = look(image, PINHOLE, MOUNTING, seen, where, None, OPTIONS)
                 assert isinstance(fix, Localized)
-                told = replace(fix, covered=0.8)
-                odometry.note(Frame(image, k * 10**8, k, 0), told, templates, WORLD)
-            assert await odometry.begun(WORLD) is not None
+                assert fix.is_on_map == (k < 5)
+                told = replace(fix, covered=0.8 if k < 5 else 0.3)
+                odometry.note(Frame(image, k * 10**8, k, 0), told, seen, WORLD)
+                await odometry.settled()
+                if k == 4:
+                    assert await odometry.begun(WORLD) is not None
             world = WORLD[0], n_jumps
             odometry.displaced(by, by @ truth, small, world)
             assert odometry.templates_in(world) is None
@@ -295,12 +302,13 @@ def test_who_was_elsewhere_goes_on_by_own_frames_from_there(n_jumps: int) -> Non
             assert (local is not None) == (n_jumps == 1)
             if local is None:
                 return
-            next_one = truth_at(2.3)
+            next_one = truth_at(1.0 + 0.3 * (5 + own_frames) - 0.2)
             image = photograph(next_one, np.random.default_rng(9))
-            expected = Prior((by @ next_one).retracted(0.01 * np.ones(6)), 4.0 * small)
+            expected_at = by @ next_one if own_frames else next_one
+            expected = Prior(expected_at.retracted(0.01 * np.ones(6)), 4.0 * small)
             found = follow_own_views(image, PINHOLE, MOUNTING, local, expected, None, OPTIONS)
             assert isinstance(found, Localized)
-            off = (by @ next_one).local(found.world_from_body)
+            off = expected_at.local(found.world_from_body)
             assert np.linalg.norm(off[:3]) < 0.1
             assert np.linalg.norm(off[3:]) < 0.01
             assert nees(off, found.covariance()) < 25.0

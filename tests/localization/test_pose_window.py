@@ -106,6 +106,26 @@ def test_who_was_elsewhere_takes_all_views_along() -> None:
     assert moved.poses == []
 
 
+@pytest.mark.parametrize("is_placed_anew", [False, True])
+def test_who_flew_otherwise_than_believed_was_where_the_map_had_put_it(
+    *, is_placed_anew: bool
+) -> None:
+    """Off was the way from the last view, whatever the ones before it were found by."""
+    flown = window()
+    flown.add_by_map("c", found(LEVERS["c"], KEYS))
+    flown.drop(1)
+    if is_placed_anew:
+        poses = [Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (2.0, 1.0, 0.0)]
+        flown.settle("cva", Placement(poses, spread(5, 18), 0, np.eye(18)))
+    before, known = list(flown.poses), flown.covariance_of("avc")
+    flown.displace(Pose(np.eye(3), np.ones(3)), Pose.identity(), spread(9, 6))
+    assert flown.poses == before
+    np.testing.assert_array_equal(flown.covariance_of("avc"), known)
+    flown.drop(2)
+    flown.displace(Pose(np.eye(3), np.ones(3)), Pose.identity(), spread(9, 6))
+    assert flown.poses != before[:2]
+
+
 def test_what_is_dropped_leaves_the_others_as_they_are() -> None:
     less = window()
     before = less.covariance_of("av")

@@ -161,6 +161,8 @@ class Odometry:
     def displaced(self, by: Pose, at: Pose, covariance: Array, world: tuple[bytes, int]) -> None:
         """Go on from where we are in truth: how our own frames lie to each other holds as before.
 
+        They go along, unless the last of them was where the map has put it; see ``PoseWindow``.
+
         Args:
             by: what the belief was moved by, in the world.
             at: where to.

@@ -35,6 +35,7 @@ class PoseWindow(Generic[_View]):
     def __init__(self) -> None:
         self.views: list[_View] = []
         self.poses: list[Pose] = []
+        self._are_by_map: list[bool] = []
         # Of the views' poses, and of the keyframes of the swarm's map after them.
         self._covariance = np.zeros((0, 0))
         self._map_covariance: Array | None = None
@@ -43,6 +44,7 @@ class PoseWindow(Generic[_View]):
         """Forget all views."""
         self.views.clear()
         self.poses.clear()
+        self._are_by_map.clear()
         self._covariance, self._map_covariance = np.zeros((0, 0)), None
 
     def pose_of(self, view: _View) -> Pose:
@@ -73,7 +75,7 @@ class PoseWindow(Generic[_View]):
             self._covariance = block_diag(self._covariance[:n, :n], fix.keyframe_covariance)
         lever = np.zeros((6, len(self._covariance)))
         lever[:, n:] = fix.map_lever
-        self._add(view, fix, lever)
+        self._add(view, fix, lever, is_by_map=True)
 
     def add_by_views(self, view: _View, fix: Localized, keyframes: Sequence[_View]) -> None:
         """Add a view that was found by a map of earlier ones.
@@ -89,7 +91,7 @@ class PoseWindow(Generic[_View]):
         lever, n = np.zeros((6, len(self._covariance))), 6 * len(keyframes)
         lever[:, self._rows_of(keyframes)] = fix.map_lever[:, :n]
         by_scene = fix.map_lever[:, n:]
-        self._add(view, fix, lever)
+        self._add(view, fix, lever, is_by_map=False)
         rows = self._rows_of([view])
         scene = fix.keyframe_covariance[n:, n:]
         self._covariance[np.ix_(rows, rows)] += by_scene @ scene @ by_scene.T
@@ -111,34 +113,39 @@ class PoseWindow(Generic[_View]):
         of_views = (6 * np.array(order)[:, None] + np.arange(6)).ravel()
         rows = np.concatenate([of_views, np.arange(6 * len(views), len(joint))])
         self._covariance = joint[np.ix_(rows, rows)]
+        self._are_by_map = [self._are_by_map[self.views.index(views[k])] for k in order]
         self.views = [views[k] for k in order]
         self.poses = [placement.bodies[k] for k in order]
 
     def displace(self, by: Pose, at: Pose, covariance: Array) -> None:
-        """Move all views together: one of them, or what lies between, was elsewhere than believed.
+        """Move all views together: what the earlier ones had led the last one to was off.
+
+        Where the swarm's map has put the last one, all stay: it is the way from there that was not
+        as believed.
 
         Args:
             by: what their poses are moved by, in the world.
-            at: where that one was in truth.
+            at: where we are in truth.
             covariance: (6, 6) local, of that: what all are off by from now on, whatever they were.
         """
         n = 6 * len(self.views)
+        if n == 0 or self._are_by_map[-1]:
+            return
         self.poses = [by @ pose for pose in self.poses]
-        if n:
-            lever = np.concatenate([adjoint(pose.inverse() @ at) for pose in self.poses])
-            self._covariance[:n, :n] += lever @ covariance @ lever.T
+        lever = np.concatenate([adjoint(pose.inverse() @ at) for pose in self.poses])
+        self._covariance[:n, :n] += lever @ covariance @ lever.T
 
     def drop(self, index: int) -> None:
         """Drop a view."""
         rows = np.arange(6 * index, 6 * index + 6)
         self._covariance = np.delete(np.delete(self._covariance, rows, axis=0), rows, axis=1)
-        del self.views[index], self.poses[index]
+        del self.views[index], self.poses[index], self._are_by_map[index]
 
     def _rows_of(self, views: Sequence[_View]) -> NDArray[np.intp]:
         first = np.array([6 * self.views.index(view) for view in views], dtype=np.intp)
         return np.asarray((first[:, None] + np.arange(6)).ravel())
 
-    def _add(self, view: _View, fix: Localized, lever: Array) -> None:
+    def _add(self, view: _View, fix: Localized, lever: Array, *, is_by_map: bool) -> None:
         """Add a view that errs as all before do by a lever, and by itself."""
         n = 6 * len(self.views)
         grown = np.eye(len(self._covariance))
@@ -148,3 +155,4 @@ class PoseWindow(Generic[_View]):
         self._covariance = 0.5 * (joint + joint.T)
         self.views.append(view)
         self.poses.append(fix.world_from_body)
+        self._are_by_map.append(is_by_map)
