@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+from contextlib import suppress
+
 import numpy as np
 import pytest
 
@@ -10,12 +13,19 @@ from tests.daemon.swarm import FAST, INTER
 from tests.daemon.waiting import run
 from vcl_companion.daemon.map_branches import MapBranches
 from vcl_companion.daemon.map_handing import MapHanding
+from vcl_companion.daemon.map_offer import MapOffer
 from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.swarm.group import Group, SwarmOptions
-from vcl_companion.swarm.transfer import BlobKind, Transfers
-from vcl_companion.wire.chunks import Chunk
+from vcl_companion.swarm.transfer import (
+    BlobDelivered,
+    BlobKind,
+    BlobReceived,
+    Event,
+    Transfers,
+)
+from vcl_companion.wire.chunks import Chunk, TransferStatus
 from vcl_companion.wire.map_codec import revision_of
 from vcl_companion.wire.messages import MapState
 from vcl_companion.wire.tunnel import decode_payload
@@ -44,6 +54,24 @@ def tags(transfers: Transfers, now_s: float) -> set[int]:
     payloads = transfers.poll(now_s)[0]
     messages = [decode_payload(one.payload_type, one.payload) for one in payloads]
     return {message.tag for message in messages if isinstance(message, Chunk)}
+
+
+def across(
+    here: Transfers, there: Transfers, now_s: float
+) -> tuple[list[BlobReceived], list[BlobDelivered]]:
+    """Carry what drone 1 sends to drone 2, and its answers, over a link that loses nothing."""
+    events: list[Event] = []
+    for _ in range(50):
+        for sender, receiver, by in ((here, there, 1), (there, here, 2)):
+            for one in sender.poll(now_s)[0]:
+                message = decode_payload(one.payload_type, one.payload)
+                assert isinstance(message, (Chunk, TransferStatus))
+                events += receiver.receive(by, message, now_s)
+        now_s += 0.01
+    return (
+        [event for event in events if isinstance(event, BlobReceived)],
+        [event for event in events if isinstance(event, BlobDelivered)],
+    )
 
 
 class Member:
@@ -93,6 +121,87 @@ def test_the_first_of_those_who_have_it_hands_it() -> None:
     third.group.map_state(2, MapState(OURS, 900, True), 0.0)
     third.group.map_state(1, THEIRS, 0.0)
     assert third.handed_at_s() is None
+
+
+def test_who_has_given_us_our_map_hands_what_it_has_made_of_it() -> None:
+    """Both would be sent, each half as fast."""
+    member = Member()
+    member.branches.given_by(3)
+    member.group.map_state(1, THEIRS, 0.0)
+    member.group.map_state(3, MapState(b"made of.", 950, True), 0.0)
+    assert member.handed_at_s() is None
+    # Unless it has left ours, or is not there any more.
+    member.group.map_state(3, THEIRS, 0.0)
+    assert member.handed_at_s() is not None
+    member.group.map_state(3, MapState(b"", 0, False), 0.0)
+    assert member.handed_at_s() is not None
+    member.group.map_state(3, MapState(b"made of.", 950, True), 0.0)
+    member.group.heartbeat(1, 60.0)
+    member.group.poll(60.0)
+    assert member.group.teammates == (1, 2)
+    assert member.handed_at_s() is not None
+
+
+def test_what_peers_hold_is_known_of_the_last_of_their_maps_that_is() -> None:
+    member, names = Member(), MapOffer.of(BlobKind.MAP, demo.encoded_map(1, 2)).images()
+    branches, group = member.branches, member.group
+    assert branches.held_by(3) == branches.held_by(1) == frozenset()
+    branches.note_held()
+    assert branches.held_by(3) == names
+    assert branches.held_by(1) == frozenset()
+    group.map_state(3, MapState(b"made of.", 950, True), 0.0)
+    branches.note_held()
+    assert branches.held_by(3) == names
+    branches.merged(1, THEIRS.revision, frozenset({b"an image"}))
+    assert branches.held_by(1) == {b"an image"}
+    group.map_state(3, THEIRS, 0.0)
+    assert branches.held_by(3) == {b"an image"}
+
+
+@pytest.mark.parametrize("comes", ["known", "unknown", "in vain", "without a map"])
+def test_who_flew_apart_is_sent_no_images_that_it_has(comes: str) -> None:
+    async def scenario() -> None:
+        group, maps = Group(SwarmOptions((1, 2)), 1), MapStore("")
+        transfers = Transfers(FAST, np.random.default_rng(0))
+        hands = handing(group, maps, transfers)
+        making = asyncio.create_task(hands.run())
+        stored = maps.replace(demo.encoded_map(1, 2), demo.map_index(1, 2))
+        group.set_own_state(MapState(OURS, 900, True))
+        group.map_state(2, THEIRS if comes == "unknown" else MapState(OURS, 900, True), 0.0)
+        hands.hand_out(0.0)
+        # Since then it has made another one of it, or lost it; ours has a third view.
+        whole = demo.encoded_map(1, 2, 3)
+        maps.replace(whole, demo.map_index(1, 2, 3))
+        group.set_own_state(MapState(revision_of(whole), 950, True))
+        there, came = Transfers(FAST, np.random.default_rng(1)), list[BlobReceived]()
+        state = MapState(b"", 0, False) if comes == "without a map" else THEIRS
+        for n in range(100):
+            now_s = 0.5 * n
+            group.map_state(2, state, now_s)
+            hands.hand_out(now_s)
+            await asyncio.sleep(0.02)
+            received, delivered = across(transfers, there, now_s)
+            came += received
+            for one in delivered if comes == "in vain" else ():
+                hands.delivered(2, one.transfer_id, now_s)
+            if len(came) == (2 if comes == "in vain" else 1):
+                break
+        kinds, n_bytes = [one.kind for one in came], [len(one.blob) for one in came]
+        if comes in ("known", "in vain"):
+            shorter = MapOffer.of(came[0].kind, came[0].blob)
+            here = shorter.images_here({}, stored)
+            assert shorter.whole(None, here) == whole
+            assert n_bytes[0] < 0.5 * len(whole)
+        if comes == "known":
+            assert kinds == [BlobKind.MAP_UPDATE]
+        else:
+            assert kinds[-1] == BlobKind.MAP
+            assert came[-1].blob == whole
+        making.cancel()
+        with suppress(asyncio.CancelledError):
+            await making
+
+    run(scenario())
 
 
 def test_until_a_part_has_said_what_it_has_or_long_enough_ours_goes_on_without_it() -> None:

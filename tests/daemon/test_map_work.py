@@ -28,6 +28,7 @@ from vcl_companion.mapping.options import NoMap
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.wire.header import BlobKind
 from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
+from vcl_companion.wire.map_update import without_images
 
 PAIR = demo.encoded_map(1, 2)
 
@@ -126,9 +127,10 @@ def test_an_image_takes_fewer_bytes_where_less_of_it_is_needed(work: MapWork) ->
 
 def test_another_map_is_merged_into_the_one_in_use(work: MapWork) -> None:
     other = demo.encoded_map(1, 2, 3)
+    offer = MapOffer.of(BlobKind.MAP, other)
 
     async def check() -> None:
-        built = await work.merged(pair(), other)
+        built = await work.merged(pair(), offer, {})
         # Drones 1 and 2 are in both, at one instant.
         assert isinstance(built, LandmarkMap), built
         assert built.parent == built.world == revision_of(PAIR)
@@ -137,9 +139,26 @@ def test_another_map_is_merged_into_the_one_in_use(work: MapWork) -> None:
         handed = await work.encoded(built, pair())
         assert 0 < len(handed.update) < len(handed.data)
         with pytest.raises(WireError):
-            await work.merged(pair(), other[:-7])
-        itself = await work.merged(pair(), PAIR)
+            await work.merged(pair(), replace(offer, blob=other[:-7]), {})
+        itself = await work.merged(pair(), MapOffer.of(BlobKind.MAP, PAIR), {})
         assert isinstance(itself, NoMap)
+        # Images of its own need not come once more.
+        trio = replace(
+            pair(), revision=revision_of(other), data=other, index=demo.map_index(1, 2, 3)
+        )
+        standalone = await work.standalone(trio)
+        shorter = MapOffer.of(
+            BlobKind.MAP_UPDATE,
+            without_images(standalone, MapOffer.of(BlobKind.MAP, PAIR).images()),
+        )
+        assert len(shorter.blob) < 0.5 * len(other)
+        assert (shorter.revision, shorter.parent) == (offer.revision, offer.parent)
+        assert shorter.images() == offer.images()
+        same = await work.merged(pair(), shorter, shorter.images_here({}, pair()))
+        assert isinstance(same, LandmarkMap)
+        assert encode_map(same) == encode_map(built)
+        with pytest.raises(WireError, match="not here"):
+            await work.merged(pair(), shorter, {})
 
     run(check())
 

@@ -17,6 +17,7 @@ from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.mapping.landmark_map import JoinedMap, LandmarkMap
 from vcl_companion.swarm.group import Group
 from vcl_companion.wire.header import BlobKind
+from vcl_companion.wire.map_update import name_of_image
 
 # A coordinator whose map we do not know is about to send it, as a rule, if it had ours before. If
 # it had not, it knows nothing of what ours has in it: there is time to hear what it says next.
@@ -25,6 +26,8 @@ _SENDS_S, _SAYS_S = 5.0, 1.0
 # Then it is handed over as it is: who cannot reach the coordinator would keep us from it for ever.
 _GOES_ON_S = 3.0
 _MAX_REFUSED = 64
+# Revisions whose images are known by name, and drones that are away.
+_MAX_KNOWN, _MAX_AWAY = 64, 64
 
 
 class MapBranches:
@@ -48,6 +51,8 @@ class MapBranches:
         self._refused: deque[bytes] = deque(maxlen=_MAX_REFUSED)
         self._had_ours: tuple[bytes, set[int]] = (b"", set())
         self._merged: set[int] = set()  # other teams' coordinators, whose map is in ours
+        self._images: dict[bytes, frozenset[bytes]] = {}  # of revisions that peers may fly on
+        self._held: dict[int, frozenset[bytes]] = {}
         self._foreign_since_s: dict[int, float] = {}
 
     def given_by(self, peer: int) -> None:
@@ -69,9 +74,40 @@ class MapBranches:
         """Note a map that cannot be merged with ours."""
         self._refused.append(revision)
 
-    def merged(self, peer: int) -> None:
-        """Note that a peer's map has been merged into ours."""
+    def merged(self, peer: int, revision: bytes, images: frozenset[bytes]) -> None:
+        """Note that a peer's map has been merged into ours, and the names of its images."""
         self._merged.add(peer)
+        self._note_images(revision, images)
+        self._held[peer] = images
+
+    def held_by(self, peer: int) -> frozenset[bytes]:
+        """Return the names of the images that a peer holds with its map, as far as we know.
+
+        Those of the last of its maps that we know: of what it has made since we have none.
+        """
+        state = self._group.state_of(peer)
+        images = None if state is None else self._images.get(state.revision)
+        if images is not None:
+            self._held[peer] = images
+        return self._held.get(peer, frozenset())
+
+    def note_held(self) -> None:
+        """Note who flies on our map, or on one that we know: what it holds is known later on."""
+        current = self._maps.current
+        if current is not None and current.revision not in self._images:
+            keyframes = current.index.landmark_map.keyframes
+            names = frozenset(name_of_image(keyframe.image_bytes) for keyframe in keyframes)
+            self._note_images(current.revision, names)
+        alive = self._group.alive
+        for peer in [peer for peer in self._held if peer not in alive][:-_MAX_AWAY]:
+            del self._held[peer]
+        for peer in alive:
+            self.held_by(peer)
+
+    def _note_images(self, revision: bytes, images: frozenset[bytes]) -> None:
+        self._images[revision] = images
+        while len(self._images) > _MAX_KNOWN:
+            del self._images[next(iter(self._images))]
 
     def is_awaited(self, peer: int, now_s: float) -> bool:
         """Whether a teammate is not to be handed ours yet: it has one that we could merge."""
@@ -102,8 +138,21 @@ class MapBranches:
         wait_s = _SENDS_S if coordinator in self._had_ours[1] else _SAYS_S
         if now_s < since_s + wait_s or self._is_receiving():
             return None
+        if self._giver_hands(state.revision):
+            return None
         is_first_holder = group.holders(current.revision)[:1] == (group.own_id,)
         return coordinator if is_first_holder else None
+
+    def _giver_hands(self, revision: bytes) -> bool:
+        """Whether who has given us our map has it, or what it has made of it since, to hand.
+
+        Not one that flies on the coordinator's, of such a revision.
+        """
+        giver = self._given_by
+        if giver == self._group.own_id or giver not in self._group.teammates:
+            return False
+        state = self._group.state_of(giver)
+        return state is not None and state.revision not in (b"", revision)
 
     def _note_holders(self, revision: bytes) -> None:
         """Remember who has had our map, as long as it is in use here."""
@@ -125,7 +174,9 @@ class MapBranches:
         group, current = self._group, self._maps.current
         if current is None or current.part_of or not group.is_coordinator:
             return False
-        if offer.kind != BlobKind.MAP or offer.parent == current.revision:
+        if offer.kind == BlobKind.MAP_PART or offer.needs_parent:
+            return False
+        if offer.parent == current.revision:
             return False
         return self._is_foreign(offer.revision) and (
             peer in group.teammates or self._is_of_junior_team(peer)

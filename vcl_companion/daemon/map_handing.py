@@ -18,6 +18,7 @@ from vcl_companion.daemon.map_parts import TAKE_IN_S, MapParts
 from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.passed_frames import PassedFrames
+from vcl_companion.daemon.standalone_map import StandaloneMap
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.transfer import BlobKind, Transfers
 from vcl_companion.wire.header import MAX_BLOB_BYTES
@@ -87,6 +88,7 @@ class MapHanding:
             lambda peer, blob: transfers.submit(peer, BlobKind.MAP_PART, blob, self._now_s()),
             transfers.quick_bytes,
         )
+        self._standalone = StandaloneMap(maps, work)
         self.ahead: HandOut | None = None
         self._handed: dict[int, _Handed] = {}
         self._update: _Update | None = None
@@ -94,8 +96,10 @@ class MapHanding:
         self._behind_since_s: float | None = None  # the coordinator, as far as known
 
     async def run(self) -> None:
-        """Have parts of maps made until cancelled."""
-        await self._parts.run()
+        """Have parts of maps, and forms of them, made until cancelled."""
+        async with asyncio.TaskGroup() as made:
+            made.create_task(self._parts.run())
+            made.create_task(self._standalone.run())
 
     def was_given(self, peer: int, revision: bytes) -> None:
         """Note who has given us the map in use: it has it, though that may not have been heard."""
@@ -127,6 +131,7 @@ class MapHanding:
         if stored is None or (current is not None and current.part_of):
             return
         self._abandon_all_but(stored.revision)
+        self._branches.note_held()
         if not self._coordinator_is_behind():
             self._behind_since_s = None
         elif self._behind_since_s is None:
@@ -151,7 +156,7 @@ class MapHanding:
             self._hand(peer, stored, now_s, self._form_for)
         merges = self._branches.receiver(now_s)
         for peer in (*self._branches.joining(), *(() if merges is None else (merges,))):
-            self._hand(peer, stored, now_s, _whole)
+            self._hand(peer, stored, now_s, self._standalone_for)
 
     def _is_on_part(self, peer: int) -> bool:
         """Whether a peer without a map flies on a part of one."""
@@ -204,7 +209,7 @@ class MapHanding:
         state = self._group.state_of(peer)
         has_parent = state is not None and state.revision == stored.parent
         if not (stored.update and has_parent and n_delivered == 0):
-            return BlobKind.MAP, stored.data
+            return self._standalone_for(peer, stored, n_delivered)
         if self._update is None or self._update.revision != stored.revision:
             self._update = _Update(stored.revision, images_in_update(stored.update), {})
         images, without = self._update.images, self._update.without
@@ -214,6 +219,20 @@ class MapHanding:
         if held not in without:
             without[held] = without_images(stored.update, held)
         return BlobKind.MAP_UPDATE, without[held]
+
+    def _standalone_for(
+        self, peer: int, stored: HandOut, n_delivered: int
+    ) -> tuple[BlobKind, bytes] | None:
+        """Return what to send a peer that has none of our map's parents; None: not made yet.
+
+        Without the images that it has with its own, unless that was in vain.
+        """
+        may_hold = n_delivered == 0 and self._group.has_map(peer)
+        held = self._branches.held_by(peer) if may_hold else frozenset[bytes]()
+        standalone = self._standalone.without(stored, held)
+        if standalone is None:
+            return None
+        return (BlobKind.MAP_UPDATE, standalone) if standalone else (BlobKind.MAP, stored.data)
 
     def _lacking(self, revision: bytes) -> list[int]:
         group = self._group
@@ -245,10 +264,6 @@ class MapHanding:
 
     def _now_s(self) -> float:
         return asyncio.get_running_loop().time()
-
-
-def _whole(peer: int, stored: HandOut, n_delivered: int) -> tuple[BlobKind, bytes]:
-    return BlobKind.MAP, stored.data
 
 
 def _hand_out_of(stored: StoredMap) -> HandOut:

@@ -15,6 +15,7 @@ from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.mishaps import BadBytes, made_or_no_map
 from vcl_companion.daemon.own_maps import OwnMaps
+from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import NoMap
 
@@ -41,6 +42,7 @@ class MapMerging:
         work: does the merging.
         branches: told what came of it.
         own_maps: flies on what was made.
+        passed: holds images that were sent ahead.
         is_updating: whether a round of ours is under way that updates the map.
         bad_bytes: told of a peer's that are no map, and why.
 
@@ -55,6 +57,7 @@ class MapMerging:
         work: MapWork,
         branches: MapBranches,
         own_maps: OwnMaps,
+        passed: PassedFrames,
         is_updating: Callable[[], bool],
         bad_bytes: Callable[[int, str], None],
     ) -> None:
@@ -63,6 +66,7 @@ class MapMerging:
         self._work = work
         self._branches = branches
         self._own_maps = own_maps
+        self._passed = passed
         self._is_updating = is_updating
         self._bad_bytes = bad_bytes
         self.is_under_way = False
@@ -125,8 +129,9 @@ class MapMerging:
             current = self._maps.current
             if current is None:
                 break
+            held = offer.images_here(self._passed.held, current)
             made = await made_or_no_map(
-                self._work.merged(current, offer.blob), "a map cannot be merged", "merging failed"
+                self._work.merged(current, offer, held), "a map cannot be merged", "merging failed"
             )
             if isinstance(made, LandmarkMap):
                 made = await self._own_maps.adopt(made, current) or made
@@ -134,7 +139,7 @@ class MapMerging:
                 break
             now = self._maps.current
             if now is not None and now.parent == current.revision and now.has_in_it(offer.revision):
-                self._branches.merged(peer)
+                self._branches.merged(peer, offer.revision, offer.images())
                 self._log.event("merged", f"map {offer.revision.hex()} of drone {peer}")
                 _log.info("the map of drone %d is merged into ours", peer)
                 return True

@@ -21,7 +21,12 @@ from vcl_companion.wire.map_part import decode_map_part
 from vcl_companion.wire.map_update import (
     decode_map_update,
     encode_map_update,
+    images_in_map,
+    images_in_update,
+    images_missing_in,
+    name_of_image,
     names_of_update,
+    needs_parent,
     with_images,
 )
 
@@ -31,12 +36,13 @@ class MapOffer:
     """An encoded map of which only the names have been read.
 
     Attributes:
-        kind: whole, or for one who has its parent.
+        kind: whole, or for one who has its parent, or some of its images.
         blob: its bytes.
         revision: what it calls itself; proven when it is read.
         parent: what it was made from; empty for a first map.
         update: the same for one who has its parent, if that is encoded already.
         part_of: of a part, the revision of the whole map; empty for a whole one.
+        needs_parent: whether it can be read by one who has its parent only.
     """
 
     kind: BlobKind
@@ -45,6 +51,7 @@ class MapOffer:
     parent: bytes
     update: bytes = b""
     part_of: bytes = b""
+    needs_parent: bool = False
 
     @classmethod
     def of(cls, kind: BlobKind, blob: bytes) -> MapOffer:
@@ -54,11 +61,66 @@ class MapOffer:
             WireError: the bytes do not begin like a map of this kind.
         """
         if kind == BlobKind.MAP_UPDATE:
-            return cls(kind, blob, *names_of_update(blob))
+            return cls(kind, blob, *names_of_update(blob), needs_parent=needs_parent(blob))
         if kind == BlobKind.MAP_PART:
             whole, data = decode_map_part(blob)
             return cls(kind, blob, revision_of(data), parent_of(data), part_of=whole)
         return cls(kind, blob, revision_of(blob), parent_of(blob))
+
+    def images_here(
+        self, heard: Mapping[bytes, bytes], current: StoredMap | None
+    ) -> dict[bytes, bytes]:
+        """Return what is here of the images that it takes us to hold, by their names.
+
+        Args:
+            heard: images that were sent ahead.
+            current: the map in use.
+
+        Raises:
+            WireError: the bytes are no map.
+        """
+        missing = self.images_missing()
+        if not missing:
+            return {}
+        keyframes = () if current is None else current.index.landmark_map.keyframes
+        here = dict(heard) | {name_of_image(k.image_bytes): k.image_bytes for k in keyframes}
+        return {name: here[name] for name in missing if name in here}
+
+    def images_missing(self) -> frozenset[bytes]:
+        """Return the names of the images that it takes us to hold.
+
+        Raises:
+            WireError: the bytes are no map.
+        """
+        is_update = self.kind == BlobKind.MAP_UPDATE
+        return images_missing_in(self.blob) if is_update else frozenset()
+
+    def images(self) -> frozenset[bytes]:
+        """Return the names of all images, of a whole map or an update that needs no parent.
+
+        Raises:
+            WireError: the bytes are no map.
+        """
+        if self.kind == BlobKind.MAP_UPDATE:
+            return images_in_update(self.blob) | self.images_missing()
+        return images_in_map(self.blob)
+
+    def whole(self, parent: LandmarkMap | None, held: Mapping[bytes, bytes]) -> bytes:
+        """Return the whole map's bytes.
+
+        Args:
+            parent: the map that an update that needs its parent is of.
+            held: images that were sent ahead or are of the map in use, by their names.
+
+        Raises:
+            WireError: the bytes are no map, or not one of this parent, or need an image that
+                is not held.
+        """
+        if self.kind == BlobKind.MAP:
+            return self.blob
+        if self.kind == BlobKind.MAP_PART:
+            return decode_map_part(self.blob)[1]
+        return decode_map_update(self.blob, parent, held)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +186,7 @@ def ready_map(
         features: how they are found.
         memory: finds them, and decodes images.
         tracked: whether the map is also made ready to be tracked.
-        held: images that were sent ahead, by their names.
+        held: images that it may take us to hold, by their names.
         decode: ``decode_map``, or what remembers what that has returned.
         calibration_px: what lenses may be off; see ``map_uncertainty``.
 
@@ -135,15 +197,11 @@ def ready_map(
     """
     # To a part comes what any revision of its line has beyond it.
     has_parent = current is not None and (current.revision == offer.parent or current.part_of)
-    parent = current.index.landmark_map if current is not None and has_parent else None
-    if offer.kind == BlobKind.MAP:
-        data = offer.blob
-    elif offer.kind == BlobKind.MAP_PART:
-        data = decode_map_part(offer.blob)[1]
-    elif parent is None and not (current is None and offer.parent == b""):
+    is_used = current is not None and has_parent and offer.needs_parent
+    parent = current.index.landmark_map if current is not None and is_used else None
+    if parent is None and offer.needs_parent:
         raise ValueError("an update of a map that is not in use here")
-    else:
-        data = decode_map_update(offer.blob, parent, held)
+    data = offer.whole(parent, held)
     whole = decode(data)
     if len(whole.keyframes) > MOST_KEYFRAMES:
         # What is known of each of them is in every state, which frames wait for.
@@ -153,7 +211,7 @@ def ready_map(
 
     update = offer.update
     if current is not None and current.revision == offer.parent and not update:
-        if offer.kind == BlobKind.MAP_UPDATE:
+        if offer.needs_parent:
             update = with_images(offer.blob, held)
         else:
             update = encode_map_update(data, current.index.landmark_map, whole)

@@ -17,8 +17,6 @@ from vcl_companion.daemon.usage import give_back_freed
 from vcl_companion.mapping.options import NoMap
 from vcl_companion.swarm.group import Group
 from vcl_companion.swarm.pace import look_s
-from vcl_companion.swarm.transfer import BlobKind
-from vcl_companion.wire.map_update import images_missing_in
 
 _log = logging.getLogger(__name__)
 
@@ -66,16 +64,14 @@ class MapUse:
         return await made_or_no_map(self._decoded(offer), "a map cannot be used", "using it failed")
 
     async def _decoded(self, offer: MapOffer) -> ReadyMap:
-        """Make a map ready with those of its images that were sent ahead.
+        """Make a map ready with those of its images that are here.
 
         Raises:
             WireError: the bytes are no map, or what they need is not here.
             ValueError: an image cannot be used, or the map is not determined.
         """
-        is_update = offer.kind == BlobKind.MAP_UPDATE
-        missing = images_missing_in(offer.blob) if is_update else frozenset[bytes]()
-        held = {name: image for name, image in self._passed.held.items() if name in missing}
-        return await self._work.ready(offer, self._maps.current, held)
+        current = self._maps.current
+        return await self._work.ready(offer, current, offer.images_here(self._passed.held, current))
 
     async def fly_on(self, ready: ReadyMap) -> None:
         """Fly on a map from the next frame on; return when it is written down."""

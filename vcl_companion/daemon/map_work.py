@@ -106,10 +106,12 @@ class MapWork:
         )
         return built
 
-    async def merged(self, stored: StoredMap, data: bytes) -> LandmarkMap | NoMap:
+    async def merged(
+        self, stored: StoredMap, offer: MapOffer, held: Mapping[bytes, bytes]
+    ) -> LandmarkMap | NoMap:
         """See ``Workshop``."""
         built: LandmarkMap | NoMap = await self._do_with(
-            stored, _MAPS, "merged", stored.revision, data
+            stored, _MAPS, "merged", stored.revision, offer, held
         )
         return built
 
@@ -128,6 +130,11 @@ class MapWork:
         """See ``Workshop``."""
         rest: bytes = await self._do_with(stored, _IMAGES, "rest", stored.revision, part)
         return rest
+
+    async def standalone(self, stored: StoredMap) -> bytes:
+        """See ``Workshop``."""
+        made: bytes = await self._do_with(stored, _IMAGES, "standalone", stored.revision)
+        return made
 
     async def ready(
         self, offer: MapOffer, current: StoredMap | None, held: Mapping[bytes, bytes]

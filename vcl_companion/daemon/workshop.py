@@ -221,14 +221,21 @@ class Workshop:
         stored = self._alone(revision)
         return update_map(stored, frames, self._options.map, self._memory, at_once=at_once)
 
-    def merged(self, revision: bytes, data: bytes) -> LandmarkMap | NoMap:
-        """Build the next revision of a map of it and another, encoded one; see ``merge_maps``.
+    def merged(
+        self, revision: bytes, offer: MapOffer, held: Mapping[bytes, bytes]
+    ) -> LandmarkMap | NoMap:
+        """Build the next revision of a map of it and another one; see ``merge_maps``.
+
+        Args:
+            revision: of the map.
+            offer: the other one; needs no parent.
+            held: images that it may take us to hold, by their names.
 
         Raises:
-            WireError: the bytes are no map.
+            WireError: the bytes are no map, or need an image that is not held.
         """
         stored = self._alone(revision)
-        built = merge_maps(stored, data, self._options.map, self._memory)
+        built = merge_maps(stored, offer.whole(None, held), self._options.map, self._memory)
         give_back_freed()
         return built
 
@@ -270,6 +277,11 @@ class Workshop:
         """Return what a map has beyond an encoded part of it or of an earlier revision."""
         of = decode_map(decode_map_part(part)[1])
         return encode_map_update(self._named(revision).data, of)
+
+    def standalone(self, revision: bytes) -> bytes:
+        """Return a map as an update that needs no parent: images can be left out of it."""
+        stored = self._named(revision)
+        return encode_map_update(stored.data, None, stored.index.landmark_map)
 
     def ready(self, offer: MapOffer, current: bytes, held: Mapping[bytes, bytes]) -> ReadyMap:
         """Make a map ready to be flown on, and keep it; see ``ready_map``.

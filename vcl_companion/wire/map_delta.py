@@ -76,6 +76,16 @@ def encode_changes(child: LandmarkMap, parent: LandmarkMap, known: Known) -> byt
     return _COUNT.pack(len(listed)) + data
 
 
+def n_of_parent(reader: Reader) -> int:
+    """Return how many landmarks the parent has that what follows was told for; 0: for none.
+
+    Raises:
+        WireError: the bytes end here.
+    """
+    (n_landmarks,) = reader.unpack(_COUNT)
+    return int(n_landmarks)
+
+
 def take_changes(reader: Reader, head: MapHead, parent: LandmarkMap, known: Known) -> LandmarkMap:
     """Return the map whose landmarks are the rest of the bytes.
 
@@ -91,7 +101,7 @@ def take_changes(reader: Reader, head: MapHead, parent: LandmarkMap, known: Know
     """
     views = Views(head.keyframes)
     pixels_then = steps_of_pixels(parent.observed_px)
-    if reader.unpack(_COUNT) != (len(pixels_then),):
+    if n_of_parent(reader) != len(pixels_then):
         raise WireError("map update: its parent is another one")
     stream = Stream.reading(reader.rest())
     listed = np.zeros(len(pixels_then), dtype=np.int64)

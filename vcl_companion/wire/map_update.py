@@ -1,9 +1,9 @@
-"""A map for one who has its parent, or a first one for one who has none: what is known stays there.
+"""A map for one who has its parent, or none of them: what is known stays there.
 
 Images are nearly all of a map. An update keeps most of its parent's, and the others
-may have been sent ahead, while the map was being built; of the landmarks it tells what
-has changed (``map_delta``). What comes out of decoding is the whole map's bytes,
-proven by its revision.
+may have been sent ahead, while the map was being built, or be in another map that its receiver
+flies on; of the landmarks it tells what has changed (``map_delta``). What comes out of decoding
+is the whole map's bytes, proven by its revision.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from vcl_companion.wire.map_codec import (
     revision_of,
     take_head,
 )
-from vcl_companion.wire.map_delta import encode_changes, take_changes
+from vcl_companion.wire.map_delta import encode_changes, n_of_parent, take_changes
 from vcl_companion.wire.reader import Reader
 
 # | 2  | 8 bytes | revision of the whole map                                        |
@@ -53,7 +53,8 @@ def encode_map_update(
 
     Args:
         data: the whole map, encoded.
-        parent: the revision that it names as its parent, decoded; None for a first map.
+        parent: the revision that it names as its parent, decoded; None for one who has not got
+            that, and for a first map.
         whole: the map, decoded; None: that is done here.
 
     Raises:
@@ -71,6 +72,16 @@ def encode_map_update(
         keyframes.append(replace(keyframe, image_bytes=image))
     head = encode_head(replace(MapHead.of(whole), keyframes=tuple(keyframes)))
     return _joined(revision_of(data), head + encode_changes(whole, parent, places))
+
+
+def images_in_map(data: bytes) -> frozenset[bytes]:
+    """Return the names of the images of an encoded whole map.
+
+    Raises:
+        WireError: the bytes are no map.
+    """
+    head = _head_of(Reader(data, "map", HEADER_BYTES))
+    return frozenset(name_of_image(k.image_bytes) for k in head.keyframes)
 
 
 def images_in_update(update: bytes) -> frozenset[bytes]:
@@ -92,6 +103,17 @@ def images_missing_in(update: bytes) -> frozenset[bytes]:
     """
     _, reader = _split(update)
     return frozenset(k.image_bytes for k in _head_of(reader).keyframes if _is_named(k))
+
+
+def needs_parent(update: bytes) -> bool:
+    """Return whether an encoded update takes its receiver to have its parent.
+
+    Raises:
+        WireError: the bytes are no update.
+    """
+    _, reader = _split(update)
+    _head_of(reader)
+    return n_of_parent(reader) > 0
 
 
 def without_images(update: bytes, held: Collection[bytes]) -> bytes:
@@ -150,7 +172,7 @@ def decode_map_update(
 
     Args:
         blob: what came.
-        parent: the map that it was made from, decoded; None for a first map.
+        parent: the map that it was made from, decoded; None where it does not need that.
         held: images that were sent ahead, by their names.
 
     Raises:
