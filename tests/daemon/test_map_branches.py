@@ -282,6 +282,18 @@ def test_what_the_drone_that_gave_us_our_map_makes_of_it_is_taken_for_a_moment()
     assert not member.branches.goes_on_by(3, 4.0)
 
 
+def test_a_map_that_is_coming_in_is_waited_for_longer_but_not_for_ever() -> None:
+    member = Member()
+    member.is_receiving = True
+    awaited = []
+    for n in range(100):
+        member.group.map_state(3, THEIRS, float(n))
+        awaited.append(member.branches.is_awaited(3, float(n)))
+    assert awaited == [True] * 80 + [False] * 20
+    member.is_receiving = False
+    assert not member.branches.is_awaited(3, 30.0)
+
+
 def test_who_makes_one_map_after_the_other_is_not_waited_for_any_longer() -> None:
     member = Member()
     awaited = []

@@ -28,7 +28,7 @@ from vcl_companion.mapping.options import NoMap
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.wire.header import BlobKind
 from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
-from vcl_companion.wire.map_update import without_images
+from vcl_companion.wire.map_update import encode_map_update, without_images
 
 PAIR = demo.encoded_map(1, 2)
 
@@ -159,6 +159,27 @@ def test_another_map_is_merged_into_the_one_in_use(work: MapWork) -> None:
         assert encode_map(same) == encode_map(built)
         with pytest.raises(WireError, match="not here"):
             await work.merged(pair(), shorter, {})
+
+    run(check())
+
+
+def test_a_map_is_read_without_the_images_of_another_one_in_use(work: MapWork) -> None:
+    other = demo.encoded_map(1, 2, 3)
+    trio = replace(pair(), revision=revision_of(other), data=other, index=demo.map_index(1, 2, 3))
+
+    async def check() -> None:
+        standalone = MapOffer.of(BlobKind.MAP_UPDATE, await work.standalone(trio))
+        shorter = without_images(standalone.blob, MapOffer.of(BlobKind.MAP, PAIR).images())
+        offer = MapOffer.of(BlobKind.MAP_UPDATE, shorter)
+        ready = await work.ready(offer, pair(), offer.images_here({}, pair()))
+        assert ready.data == other
+        assert not ready.contradicts
+        with pytest.raises(WireError, match="not here"):
+            await work.ready(offer, pair(), {})
+        of_it = MapOffer.of(BlobKind.MAP_UPDATE, encode_map_update(other, decode_map(PAIR)))
+        assert of_it.needs_parent
+        with pytest.raises(ValueError, match="not in use here"):
+            await work.ready(of_it, trio, {})
 
     run(check())
 

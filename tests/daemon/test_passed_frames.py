@@ -33,7 +33,7 @@ class Member:
     """The frames that one drone of three passes on and holds, and what it handed to whom."""
 
     def __init__(self, own_id: int, *, all_hear: bool = False) -> None:
-        group = Group(SwarmOptions((1, 2, 3)), own_id)
+        self.group = group = Group(SwarmOptions((1, 2, 3)), own_id)
         for peer in {1, 2, 3} - {own_id}:
             group.heartbeat(peer, 0.0)
         self.handed: list[tuple[int, bytes]] = []
@@ -83,6 +83,16 @@ def test_a_frame_goes_to_everybody_who_did_not_take_it_and_once() -> None:
     assert one.frames.on_their_way_to(3) == {of_two}
     one.frames.pass_on(own)  # what failed is tried again
     assert [peer for peer, _ in one.handed] == [2, 3, 3, 3]
+
+
+def test_who_flies_on_a_map_of_its_own_is_passed_nothing_until_that_is_in_ours() -> None:
+    one = Member(1)
+    one.group.leave_apart(frozenset({3}))
+    one.frames.pass_on(frame_of(1, b"of one"))
+    assert [peer for peer, _ in one.handed] == [2]
+    one.group.leave_apart(frozenset())
+    one.frames.pass_on(frame_of(1, b"of one, later"))
+    assert [peer for peer, _ in one.handed] == [2, 2, 3]
 
 
 def test_what_an_image_shows_of_the_map_is_for_the_coordinator_alone() -> None:

@@ -31,10 +31,12 @@ from vcl_companion.wire.map_delta import encode_changes
 from vcl_companion.wire.map_update import (
     decode_map_update,
     encode_map_update,
+    images_in_map,
     images_in_update,
     images_missing_in,
     name_of_image,
     names_of_update,
+    needs_parent,
     with_images,
     without_images,
 )
@@ -164,6 +166,33 @@ def test_only_what_is_held_stays_at_home() -> None:
     assert images_in_update(without_images(update, {NEW})) == set()
     assert images_missing_in(update) == set()
     assert images_missing_in(without_images(update, {NEW})) == {NEW}
+
+
+def test_who_has_no_parent_takes_the_whole_but_for_images_that_it_has() -> None:
+    standalone = encode_map_update(CHILD, None)
+    names = images_in_map(CHILD)
+    assert images_in_update(standalone) == names == images_in_map(CHILD + b"more")
+    assert NEW in names
+    assert len(names) == 3
+    images = {name_of_image(k.image_bytes): k.image_bytes for k in child().keyframes}
+    blob = without_images(standalone, names - {NEW})
+    assert decode_map_update(blob, None, images) == CHILD
+    assert images_missing_in(blob) == names - {NEW}
+    assert not needs_parent(standalone)
+    assert not needs_parent(blob)
+    # It is none of its parent's for one who has that, nor what is its parent's for one who has not.
+    with pytest.raises(WireError, match="parent is another"):
+        decode_map_update(blob, PARENT, images)
+    update = encode_map_update(CHILD, PARENT)
+    assert needs_parent(update)
+    with pytest.raises(WireError, match="no keyframe"):
+        decode_map_update(update, None, images)
+    for blob in (update[:-1][:40], CHILD, b""):
+        with pytest.raises(WireError):
+            needs_parent(blob)
+    for blob in (CHILD[:40], b""):
+        with pytest.raises(WireError):
+            images_in_map(blob)
 
 
 def test_an_image_that_is_not_here_is_told_of() -> None:

@@ -25,6 +25,8 @@ _SENDS_S, _SAYS_S = 5.0, 1.0
 # So long after the coordinator's has become another one, ours goes on by whoever gave it to us.
 # Then it is handed over as it is: who cannot reach the coordinator would keep us from it for ever.
 _GOES_ON_S = 3.0
+# A map that is coming in is waited for so many times longer: by a slow radio it takes a minute.
+_COMING_LONGER = 4.0
 _MAX_REFUSED = 64
 # Revisions whose images are known by name, and drones that are away.
 _MAX_KNOWN, _MAX_AWAY = 64, 64
@@ -117,7 +119,8 @@ class MapBranches:
             self._foreign_since_s.pop(peer, None)
             return False
         # Not from each of its revisions on: one that is never handed over would be waited for.
-        return now_s < self._foreign_since_s.setdefault(peer, now_s) + self._wait_s
+        since_s = self._foreign_since_s.setdefault(peer, now_s)
+        return now_s < since_s + self._wait_s * (_COMING_LONGER if self._is_receiving() else 1.0)
 
     def receiver(self, now_s: float) -> int | None:
         """Return whom to hand our map so that it is merged into its own; None for nobody."""

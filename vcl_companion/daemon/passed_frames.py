@@ -132,7 +132,10 @@ class PassedFrames:
             self.pass_on(frame)
 
     def pass_on(self, frame: FrameAnswer) -> None:
-        """Send a frame of a round to every member that neither took it nor coordinates."""
+        """Send a frame of a round to every member that neither took it nor coordinates.
+
+        Not to one that flies on a map of its own until that is in ours.
+        """
         self._look_at(frame)
         name = name_of_image(frame.image_bytes)
         blob = b""
@@ -143,7 +146,7 @@ class PassedFrames:
             state = self._group.state_of(peer)
             if peer == frame.drone_id:
                 there.held.append(name)
-            elif state is not None and not state.revision:
+            elif self._group.is_apart(peer) or (state is not None and not state.revision):
                 continue  # it has no map that an update could be of: that comes first
             elif name not in there.held and name not in there.on_their_way.values():
                 try:

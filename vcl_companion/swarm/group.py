@@ -113,6 +113,10 @@ class Group:
         """
         self._apart = peers - {self.own_id}
 
+    def is_apart(self, member: int) -> bool:
+        """Whether a member flies on a map of its own that is about to be merged into ours."""
+        return member in self._apart
+
     @property
     def is_complete(self) -> bool:
         """Whether every member is there."""
@@ -337,8 +341,8 @@ class Group:
 
     def _counts(self, member: int) -> bool:
         """Whether a teammate decides on our map, and makes it: believed, heard, not on its own."""
-        is_apart = member in self._distrusted or member in self._apart
-        return not is_apart and not self.is_silent(member)
+        is_with_us = member not in self._distrusted and not self.is_apart(member)
+        return is_with_us and not self.is_silent(member)
 
     def is_silent(self, member: int) -> bool:
         """Whether a member may be lost, which is known later: nobody else waits for its word."""
