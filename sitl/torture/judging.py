@@ -23,7 +23,9 @@ from vcl_companion.wire.map_update import (
     decode_map_update,
     images_in_update,
     images_missing_in,
+    name_of_image,
     names_of_update,
+    needs_parent,
 )
 from vcl_companion.wire.pose_messages import PoseRequest, decode_pose_request, encode_pose_request
 from vcl_companion.wire.tunnel import decode_payload, encode_payload, is_ours
@@ -101,9 +103,16 @@ def _decoded(
         case BlobKind.MAP_UPDATE:
             for read in _READ_OF_UPDATES:
                 read(blob)
-            if stored is None:
-                raise WireError("there is no parent")
-            return decode_map(decode_map_update(blob, stored.index.landmark_map, {}))
+            return decode_map(_whole_of(blob, stored))
+
+
+def _whole_of(update: bytes, stored: StoredMap | None) -> bytes:
+    """Return the map of an update as the drone that flies on another one reads it."""
+    if stored is None and needs_parent(update):
+        raise WireError("there is no parent")
+    used = None if stored is None else stored.index.landmark_map
+    held = {name_of_image(k.image_bytes): k.image_bytes for k in used.keyframes} if used else {}
+    return decode_map_update(update, used if needs_parent(update) else None, held)
 
 
 _READ_OF_UPDATES: tuple[Callable[[bytes], object], ...] = (

@@ -24,7 +24,12 @@ from vcl_companion.wire.chunks import MAX_CHUNKS, Reply, TransferStatus, receivi
 from vcl_companion.wire.frame_codec import FrameAnswer, encode_frame
 from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of
 from vcl_companion.wire.map_part import encode_map_part
-from vcl_companion.wire.map_update import encode_map_update, name_of_image, without_images
+from vcl_companion.wire.map_update import (
+    encode_map_update,
+    images_in_update,
+    name_of_image,
+    without_images,
+)
 from vcl_companion.wire.messages import FrameRequest, MapRefused, MapState
 from vcl_companion.wire.pose_messages import (
     PoseProposal,
@@ -95,6 +100,7 @@ class Valid:
             self._frame_answer, self._frame_answer, self._frame_answer, self._passed_frame,
             self._passed_frame, self._pose_request, self._pose_request, self._whole_map,
             self._odd_map, self._odd_map, self._part, self._update, self._update,
+            self._standalone,
         )  # fmt: skip
 
     def message(self, peer: int) -> Payload:
@@ -249,6 +255,13 @@ class Valid:
             last = decode_map(data).keyframes[-1].image_bytes
             update = without_images(update, {name_of_image(last)})
         return BlobKind.MAP_UPDATE, update
+
+    def _standalone(self, peer: int) -> tuple[BlobKind, bytes]:
+        """Return a map for one who has not its parent, all images in it, one, or none."""
+        make = self._dice.pick((self._whole_map, self._odd_map))
+        update = encode_map_update(make(peer)[1], None)
+        names = sorted(images_in_update(update))
+        return BlobKind.MAP_UPDATE, without_images(update, names[: self._dice.below(3) * 2])
 
     def _next_map(self, peer: int) -> tuple[bytes, bytes]:
         """Return a map that goes on from the drone's, and its update; one of a few."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 
 from vcl_companion.daemon.flight_log import FlightLog
@@ -15,7 +15,6 @@ from vcl_companion.daemon.map_store import MapStore
 from vcl_companion.daemon.map_work import MapWork
 from vcl_companion.daemon.mishaps import BadBytes, made_or_no_map
 from vcl_companion.daemon.own_maps import OwnMaps
-from vcl_companion.daemon.passed_frames import PassedFrames
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.options import NoMap
 
@@ -42,7 +41,6 @@ class MapMerging:
         work: does the merging.
         branches: told what came of it.
         own_maps: flies on what was made.
-        passed: holds images that were sent ahead.
         is_updating: whether a round of ours is under way that updates the map.
         bad_bytes: told of a peer's that are no map, and why.
 
@@ -57,7 +55,6 @@ class MapMerging:
         work: MapWork,
         branches: MapBranches,
         own_maps: OwnMaps,
-        passed: PassedFrames,
         is_updating: Callable[[], bool],
         bad_bytes: Callable[[int, str], None],
     ) -> None:
@@ -66,7 +63,6 @@ class MapMerging:
         self._work = work
         self._branches = branches
         self._own_maps = own_maps
-        self._passed = passed
         self._is_updating = is_updating
         self._bad_bytes = bad_bytes
         self.is_under_way = False
@@ -77,14 +73,20 @@ class MapMerging:
         """Return for how long no map of a peer is merged; not above 0 if one may be now."""
         return self._next_at_s.get(peer, -math.inf) - asyncio.get_running_loop().time()
 
-    async def merge(self, peer: int, offer: MapOffer) -> bool:
-        """Make our next revision of ours and a peer's that went apart; whether that was done."""
+    async def merge(self, peer: int, offer: MapOffer, held: Mapping[bytes, bytes]) -> bool:
+        """Make our next revision of ours and a peer's that went apart; whether that was done.
+
+        Args:
+            peer: who offers it.
+            offer: the map.
+            held: images that it takes us to hold, by their names.
+        """
         self.is_under_way = True
         loop = asyncio.get_running_loop()
         try:
             await self._round_is_over()
             began_s, before = loop.time(), self._images()
-            is_merged = await self._merge_into_current(peer, offer)
+            is_merged = await self._merge_into_current(peer, offer, held)
             has_new = is_merged and not self._images() <= before
             self._note(peer, loop.time() - began_s, brought=has_new)
         finally:
@@ -121,7 +123,9 @@ class MapMerging:
                 while self._is_updating():
                     await asyncio.sleep(_LOOK_S)
 
-    async def _merge_into_current(self, peer: int, offer: MapOffer) -> bool:
+    async def _merge_into_current(
+        self, peer: int, offer: MapOffer, held: Mapping[bytes, bytes]
+    ) -> bool:
         """Merge a peer's map into whichever is in use, again where that changes meanwhile."""
         self._log.event("merge", f"map {offer.revision.hex()} of drone {peer} into ours")
         made: LandmarkMap | NoMap = NoMap("ours changed meanwhile, again and again")
@@ -129,7 +133,6 @@ class MapMerging:
             current = self._maps.current
             if current is None:
                 break
-            held = offer.images_here(self._passed.held, current)
             made = await made_or_no_map(
                 self._work.merged(current, offer, held), "a map cannot be merged", "merging failed"
             )

@@ -103,7 +103,7 @@ class MapSharing:
         self.handing = MapHanding(group, transfers, maps, work, passed, self._branches)
         self.own_maps = OwnMaps(group, maps, work, self._branches, self.handing, self._use)
         self.merging = MapMerging(
-            maps, log, work, self._branches, self.own_maps, passed, is_updating, self._bad_bytes
+            maps, log, work, self._branches, self.own_maps, is_updating, self._bad_bytes
         )
 
     def offer(self, peer: int, kind: BlobKind, blob: bytes) -> None:
@@ -140,10 +140,11 @@ class MapSharing:
             if wait_s > 0:
                 self._offered.put_later(peer, offer, wait_s)
                 return
-            if self._lacks_images(offer):
+            held = offer.images_here(self._passed.held, self._maps.current)
+            if offer.images_missing() - held.keys():  # it comes whole, then
                 self._reject(peer, offer, "map", "an image of it is not here")
                 return
-            if await self.merging.merge(peer, offer):
+            if await self.merging.merge(peer, offer, held):
                 return
         refusal = await self._taken(peer, offer)
         if refusal is not None:
@@ -189,11 +190,6 @@ class MapSharing:
 
     def _may_merge(self, peer: int, offer: MapOffer) -> bool:
         return not self._trust.why_not(peer) and self._branches.is_to_merge(peer, offer)
-
-    def _lacks_images(self, offer: MapOffer) -> bool:
-        """Whether we hold not all that an offer takes us to hold: it comes whole, then."""
-        here = offer.images_here(self._passed.held, self._maps.current)
-        return bool(offer.images_missing() - here.keys())
 
     def _way_into(self, peer: int, ready: ReadyMap, revision: bytes) -> JoinedMap | str | None:
         """Say how we get onto a map; see ``way_into``. A senior team's must have ours in it.
