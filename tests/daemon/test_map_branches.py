@@ -152,7 +152,7 @@ def test_what_peers_hold_is_known_of_the_last_of_their_maps_that_is() -> None:
     group.map_state(3, MapState(b"made of.", 950, True), 0.0)
     branches.note_held()
     assert branches.held_by(3) == names
-    branches.merged(1, THEIRS.revision, frozenset({b"an image"}))
+    branches.merged(1, THEIRS.revision, frozenset({b"an image"}), 0.0)
     assert branches.held_by(1) == {b"an image"}
     group.map_state(3, THEIRS, 0.0)
     assert branches.held_by(3) == {b"an image"}
@@ -280,6 +280,17 @@ def test_what_the_drone_that_gave_us_our_map_makes_of_it_is_taken_for_a_moment()
     assert not member.branches.goes_on_by(3, 4.0)  # who hears no coordinator goes on for ever
     member.group.map_state(1, MapState(OURS, 900, True), 4.0)
     assert not member.branches.goes_on_by(3, 4.0)
+
+
+def test_once_a_map_is_merged_others_are_waited_for_no_longer_than_one_takes_to_begin() -> None:
+    """They may fly on what it was made of, and hand nothing."""
+    member = Member()
+    member.group.map_state(3, THEIRS, 0.0)
+    assert member.branches.is_awaited(3, 0.0)
+    member.branches.merged(1, b"a third.", frozenset(), 2.0)
+    assert [member.branches.is_awaited(3, at_s) for at_s in (6.9, 7.1)] == [True, False]
+    member.is_receiving = True
+    assert member.branches.is_awaited(3, 7.1)
 
 
 def test_a_map_that_is_coming_in_is_waited_for_longer_but_not_for_ever() -> None:

@@ -76,9 +76,15 @@ class MapBranches:
         """Note a map that cannot be merged with ours."""
         self._refused.append(revision)
 
-    def merged(self, peer: int, revision: bytes, images: frozenset[bytes]) -> None:
-        """Note that a peer's map has been merged into ours, and the names of its images."""
+    def merged(self, peer: int, revision: bytes, images: frozenset[bytes], now_s: float) -> None:
+        """Note that a peer's map has been merged into ours, and the names of its images.
+
+        Who flies on what that was made of, as one does whom updates reach late, hands us nothing:
+        others are waited for no longer than one takes that is about to begin.
+        """
         self._merged.add(peer)
+        for other, since_s in self._foreign_since_s.items():
+            self._foreign_since_s[other] = min(since_s, now_s + _SENDS_S - self._wait_s)
         self._note_images(revision, images)
         self._held[peer] = images
 

@@ -142,7 +142,8 @@ class MapMerging:
                 break
             now = self._maps.current
             if now is not None and now.parent == current.revision and now.has_in_it(offer.revision):
-                self._branches.merged(peer, offer.revision, offer.images())
+                now_s = asyncio.get_running_loop().time()
+                self._branches.merged(peer, offer.revision, offer.images(), now_s)
                 self._log.event("merged", f"map {offer.revision.hex()} of drone {peer}")
                 _log.info("the map of drone %d is merged into ours", peer)
                 return True
