@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable
 
 from sitl.torture.dice import Dice
+from vcl_companion.daemon.map_offer import MapOffer
 from vcl_companion.daemon.map_store import StoredMap
 from vcl_companion.errors import WireError
 from vcl_companion.links.messages import Tunnel
@@ -20,12 +21,9 @@ from vcl_companion.wire.frame_codec import FrameAnswer, decode_frame, encode_fra
 from vcl_companion.wire.map_codec import decode_map, encode_map
 from vcl_companion.wire.map_part import decode_map_part, encode_map_part
 from vcl_companion.wire.map_update import (
-    decode_map_update,
     images_in_update,
     images_missing_in,
-    name_of_image,
     names_of_update,
-    needs_parent,
 )
 from vcl_companion.wire.pose_messages import PoseRequest, decode_pose_request, encode_pose_request
 from vcl_companion.wire.tunnel import decode_payload, encode_payload, is_ours
@@ -108,11 +106,11 @@ def _decoded(
 
 def _whole_of(update: bytes, stored: StoredMap | None) -> bytes:
     """Return the map of an update as the drone that flies on another one reads it."""
-    if stored is None and needs_parent(update):
+    offer = MapOffer.of(BlobKind.MAP_UPDATE, update)
+    if stored is None and offer.needs_parent:
         raise WireError("there is no parent")
-    used = None if stored is None else stored.index.landmark_map
-    held = {name_of_image(k.image_bytes): k.image_bytes for k in used.keyframes} if used else {}
-    return decode_map_update(update, used if needs_parent(update) else None, held)
+    parent = stored.index.landmark_map if stored is not None and offer.needs_parent else None
+    return offer.whole(parent, offer.images_here({}, stored))
 
 
 _READ_OF_UPDATES: tuple[Callable[[bytes], object], ...] = (

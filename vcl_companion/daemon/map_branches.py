@@ -17,7 +17,7 @@ from vcl_companion.daemon.map_store import MapStore, StoredMap
 from vcl_companion.mapping.landmark_map import JoinedMap, LandmarkMap
 from vcl_companion.swarm.group import Group
 from vcl_companion.wire.header import BlobKind
-from vcl_companion.wire.map_update import name_of_image
+from vcl_companion.wire.map_update import images_by_name
 
 # A coordinator whose map we do not know is about to send it, as a rule, if it had ours before. If
 # it had not, it knows nothing of what ours has in it: there is time to hear what it says next.
@@ -103,9 +103,8 @@ class MapBranches:
         """Note who flies on our map, or on one that we know: what it holds is known later on."""
         current = self._maps.current
         if current is not None and current.revision not in self._images:
-            keyframes = current.index.landmark_map.keyframes
-            names = frozenset(name_of_image(keyframe.image_bytes) for keyframe in keyframes)
-            self._note_images(current.revision, names)
+            images = images_by_name(current.index.landmark_map.keyframes)
+            self._note_images(current.revision, frozenset(images))
         alive = self._group.alive
         for peer in [peer for peer in self._held if peer not in alive][:-_MAX_AWAY]:
             del self._held[peer]

@@ -21,10 +21,10 @@ from vcl_companion.wire.map_part import decode_map_part
 from vcl_companion.wire.map_update import (
     decode_map_update,
     encode_map_update,
+    images_by_name,
     images_in_map,
     images_in_update,
     images_missing_in,
-    name_of_image,
     names_of_update,
     needs_parent,
     with_images,
@@ -83,7 +83,7 @@ class MapOffer:
         if not missing:
             return {}
         keyframes = () if current is None else current.index.landmark_map.keyframes
-        here = dict(heard) | {name_of_image(k.image_bytes): k.image_bytes for k in keyframes}
+        here = dict(heard) | images_by_name(keyframes)
         return {name: here[name] for name in missing if name in here}
 
     def images_missing(self) -> frozenset[bytes]:
@@ -195,12 +195,12 @@ def ready_map(
             an image that is not.
         ValueError: an image cannot be used, or the map is not determined.
     """
-    # To a part comes what any revision of its line has beyond it.
-    has_parent = current is not None and (current.revision == offer.parent or current.part_of)
-    is_used = current is not None and has_parent and offer.needs_parent
-    parent = current.index.landmark_map if current is not None and is_used else None
-    if parent is None and offer.needs_parent:
-        raise ValueError("an update of a map that is not in use here")
+    parent = None
+    if offer.needs_parent:
+        # To a part comes what any revision of its line has beyond it.
+        if current is None or not (current.revision == offer.parent or current.part_of):
+            raise ValueError("an update of a map that is not in use here")
+        parent = current.index.landmark_map
     data = offer.whole(parent, held)
     whole = decode(data)
     if len(whole.keyframes) > MOST_KEYFRAMES:

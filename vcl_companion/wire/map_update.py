@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -44,6 +44,11 @@ _NO_MAP = LandmarkMap((), np.zeros((0, 3)), np.zeros((0, 0, 2)), 1.0, (), (), b"
 def name_of_image(image_bytes: bytes) -> bytes:
     """Return the 8 bytes that name an encoded image: the first of its SHA-256."""
     return hashlib.sha256(image_bytes).digest()[:_NAME_BYTES]
+
+
+def images_by_name(keyframes: Iterable[Keyframe]) -> dict[bytes, bytes]:
+    """Return keyframes' encoded images by their names."""
+    return {name_of_image(keyframe.image_bytes): keyframe.image_bytes for keyframe in keyframes}
 
 
 def encode_map_update(
@@ -80,8 +85,7 @@ def images_in_map(data: bytes) -> frozenset[bytes]:
     Raises:
         WireError: the bytes are no map.
     """
-    head = _head_of(Reader(data, "map", HEADER_BYTES))
-    return frozenset(name_of_image(k.image_bytes) for k in head.keyframes)
+    return frozenset(images_by_name(_head_of(Reader(data, "map", HEADER_BYTES)).keyframes))
 
 
 def images_in_update(update: bytes) -> frozenset[bytes]:
@@ -92,7 +96,7 @@ def images_in_update(update: bytes) -> frozenset[bytes]:
     """
     _, reader = _split(update)
     keyframes = _head_of(reader).keyframes
-    return frozenset(name_of_image(k.image_bytes) for k in keyframes if not _is_reference(k))
+    return frozenset(images_by_name(k for k in keyframes if not _is_reference(k)))
 
 
 def images_missing_in(update: bytes) -> frozenset[bytes]:
