@@ -28,7 +28,7 @@ STEPS: dict[str, Step] = {
     "before it is asked for": lambda one: True,
     "while frames are gathered": lambda one: bool(one.events("update")),
     "when it is ready": lambda one: one.revision != OLD,
-    "when one other has it": lambda one: len(one.group.holders(one.revision)) > 1 != (
+    "when one other has it": lambda one: len(one.group.maps.holders(one.revision)) > 1 != (
         one.revision == OLD
     ),
 }  # fmt: skip

@@ -215,12 +215,12 @@ def test_until_a_part_has_said_what_it_has_or_long_enough_ours_goes_on_without_i
             for peer in (2, 3):
                 group.map_state(peer, THEIRS, float(n))
             hands.hand_out(float(n))
-            lacking.append(group.lacking())
-            assert group.majority_wants_update == (not lacking[-1])
+            lacking.append(group.maps.lacking())
+            assert group.maps.majority_wants_update == (not lacking[-1])
         assert lacking == [()] * 20 + [(2, 3)] * 5
         group.map_state(3, MapState(OURS, 900, True), 25.0)
         hands.hand_out(25.0)
-        assert group.lacking() == (2,)
+        assert group.maps.lacking() == (2,)
 
     run(scenario())
 

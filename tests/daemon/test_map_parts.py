@@ -109,7 +109,7 @@ def test_who_comes_late_flies_on_a_part_and_then_on_the_whole(tmp_path: Path) ->
     async def scenario() -> None:
         async with swarm(1, 2, 3, path=tmp_path) as members:
             one, _ = await on_the_map(members, 1, 2)
-            await until(lambda: one.group.holders(REVISION) == (1, 2))
+            await until(lambda: one.group.maps.holders(REVISION) == (1, 2))
             three = await members.start(3, transfer=SLOW)
             # The whole may be behind it before anybody looks again.
             first = asyncio.create_task(three.maps.decided())
@@ -119,7 +119,7 @@ def test_who_comes_late_flies_on_a_part_and_then_on_the_whole(tmp_path: Path) ->
             assert part.part_of == REVISION
             await computed(lambda: three.revision == REVISION)
             assert [line["keyframes"] for line in three.lines("map")] == [3, 5]
-            await until(lambda: one.group.holders(REVISION) == (1, 2, 3))
+            await until(lambda: one.group.maps.holders(REVISION) == (1, 2, 3))
             await passes(5.0)
             for drone in (one, three):
                 assert drone.revision == REVISION
@@ -133,7 +133,7 @@ def test_a_leader_that_is_back_on_a_part_hands_it_to_nobody(tmp_path: Path) -> N
     async def scenario() -> None:
         async with swarm(1, 2, 3, path=tmp_path) as members:
             two, three = await on_the_map(members, 2, 3)
-            await until(lambda: two.group.holders(REVISION) == (2, 3))
+            await until(lambda: two.group.maps.holders(REVISION) == (2, 3))
             one = await members.start(1, transfer=SLOW)
             await one.see(demo.frame(1))
             await computed(lambda: one.revision == REVISION)
@@ -151,14 +151,14 @@ def test_a_joiner_whose_giver_dies_after_the_part_gets_the_whole_from_the_next(
     async def scenario() -> None:
         async with swarm(1, 2, 3, path=tmp_path) as members:
             one, two = await on_the_map(members, 1, 2)
-            await until(lambda: two.group.holders(REVISION) == (1, 2))
+            await until(lambda: two.group.maps.holders(REVISION) == (1, 2))
             three = await members.start(3, transfer=SLOW)
             await computed(lambda: three.maps.current is not None)
             await members.stop(one)
             while three.revision != REVISION:
                 await passes(1.0)
                 await asyncio.sleep(0.01)
-            await until(lambda: 3 in two.group.holders(REVISION))
+            await until(lambda: 3 in two.group.maps.holders(REVISION))
             assert [line["keyframes"] for line in three.lines("map")] == [3, 5]
 
     run(scenario())

@@ -119,7 +119,7 @@ async def it_counts_for_nothing_but_is_told(drone: Drone, stranger: Stranger) ->
     state = drone.group.state_of(1)  # it is heard
     assert state is not None
     assert state.wants_update
-    assert drone.group.wanting_update == ()
+    assert drone.group.maps.wanting_update == ()
     assert drone.revision == before
 
 
@@ -243,7 +243,7 @@ def test_a_newcomer_that_took_a_bent_map_follows_the_others(tmp_path: Path) -> N
             await passes(6.0)  # it is looked at again
             for stranger in (one, three):
                 stranger.say(MapState(revision_of(NEXT), 9, True, tracked=80), 2)
-            await until(lambda: len(drone.group.holders(revision_of(NEXT))) == 2)
+            await until(lambda: len(drone.group.maps.holders(revision_of(NEXT))) == 2)
             one.forget()
             one.hand(BlobKind.MAP, NEXT, 2)
             await until(lambda: drone.revision == revision_of(NEXT))
@@ -316,10 +316,10 @@ def test_a_map_that_cannot_be_taken_for_an_unforeseen_reason_ends_nothing(
             drone = await members.start(2, (1, 2))
             stranger = await members.stranger(1)
             await stranger.meets(2)
-            carry, drone.group.may_lead = drone.group.may_lead, None  # type: ignore[assignment]
+            carry, drone.group.leadership.may_lead = drone.group.leadership.may_lead, None  # type: ignore[assignment]
             stranger.hand(BlobKind.MAP, NEXT, 2)
             await until(lambda: "taking a map failed, and goes on" in caplog.messages)
-            drone.group.may_lead = carry  # type: ignore[method-assign]
+            drone.group.leadership.may_lead = carry  # type: ignore[method-assign]
             stranger.forget()
             drone.exchange._sharing.offer(1, BlobKind.MAP, NEXT)
             await until(lambda: drone.revision == revision_of(NEXT))

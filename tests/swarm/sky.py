@@ -107,8 +107,8 @@ class Sky:
         revision = b"revision" if member in self._mapped else b""
         world = self.world.get(member, _WORLD) if revision else b""
         state = MapState(
-            revision, 1, bool(revision), 1, member not in self.served, group.team, group.epoch,
-            world, group.signature_to_tell(self.now_s),
+            revision, 1, bool(revision), 1, member not in self.served, group.team,
+            group.leadership.epoch, world, group.signature_to_tell(self.now_s),
         )  # fmt: skip
         group.set_own_state(state)
         self._send(member, encode_payload(state)[1])
@@ -141,7 +141,7 @@ class Sky:
         if group.own_id not in self._mapped or not group.is_coordinator:
             return
         for team in group.teams_met:
-            host = group.coordinator_of(team)
+            host = group.leadership.coordinator_of(team)
             if group.is_senior(team) and host in self.up and host in self._mapped:
                 group.join(team)
                 return
@@ -149,7 +149,7 @@ class Sky:
     def _get_map(self, group: Group) -> None:
         if group.own_id in self._mapped:
             return
-        holders = group.holders(b"revision")
+        holders = group.maps.holders(b"revision")
         if any(self.up.get(h) is not None and h in self._mapped for h in holders):
             self._mapped.add(group.own_id)
 
@@ -157,8 +157,8 @@ class Sky:
         for member, group in self.up.items():
             assert group.coordinator in group.members
             known = self._known[member]
-            assert group.epoch >= known.get(group.team, 0), "an epoch went back"
-            known[group.team] = group.epoch
+            assert group.leadership.epoch >= known.get(group.team, 0), "an epoch went back"
+            known[group.team] = group.leadership.epoch
             if group.is_coordinator:
-                leads = self.led.setdefault((group.team, group.epoch), member)
+                leads = self.led.setdefault((group.team, group.leadership.epoch), member)
                 assert leads == member, "two have led under one epoch"

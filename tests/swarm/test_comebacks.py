@@ -41,11 +41,11 @@ def test_a_leader_that_restarts_again_and_again_leaves_the_lead_to_the_next(
     assert {1} in before[0]  # once it leads at once
     for _ in range(5):
         assert {frozenset(led) for led in restart(sky, 1, up_s, down_s)} == {frozenset({2})}
-        assert all(sky.up[m].may_lead(2) for m in (3, 4, 5))
+        assert all(sky.up[m].leadership.may_lead(2) for m in (3, 4, 5))
     sky.start(1)
     sky.run(45.0)
     assert set(sky.leads().values()) == {(0, 1)}
-    assert all(group.may_lead(1) for group in sky.up.values())
+    assert all(group.leadership.may_lead(1) for group in sky.up.values())
 
 
 def test_who_takes_its_place_is_judged_alike() -> None:
@@ -86,17 +86,17 @@ def test_a_leader_that_restarts_too_fast_to_be_lost_leaves_the_lead_too() -> Non
     for second in range(60):
         now_s = float(second)
         for other in (3, 4, 5):
-            group.map_state(other, state(group.epoch), now_s)
+            group.map_state(other, state(group.leadership.epoch), now_s)
         # It has been handed the map after six seconds, and falls over it.
         has_map = second < 20 or second % 10 > 5
         group.map_state(1, state(revision=b"revision" if has_map else b""), now_s)
-        group.set_own_state(state(group.epoch))
+        group.set_own_state(state(group.leadership.epoch))
         group.poll(now_s)
         led.append(group.coordinator)
     assert led[:29] == [1] * 29
     assert set(led[30:35]) == {2}
     assert set(led[40:]) == {2}
-    assert group.own_epoch > 1
+    assert group.leadership.own_epoch > 1
 
 
 def test_the_lead_waits_longer_each_time_and_not_for_ever() -> None:

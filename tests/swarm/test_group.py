@@ -51,7 +51,7 @@ def test_a_drone_alone_is_its_own_complete_group() -> None:
     assert group.poll(1e9) == []
     assert group.next_poll_s() is None
     group.set_own_state(NEW)
-    assert group.lacking() == ()
+    assert group.maps.lacking() == ()
 
 
 def test_of_many_members_those_that_are_needed_most_contribute() -> None:
@@ -60,11 +60,11 @@ def test_of_many_members_those_that_are_needed_most_contribute() -> None:
         if member not in (50, 60):
             group.map_state(member, MapState(b"a       ", 900, True, tracked=1000 - member), 0.0)
     assert group.measured == (7, 90)
-    assert group.contributors((1, *group.measured), 6) == (50, 1, 7, 90, 100, 99)
+    assert group.maps.contributors((1, *group.measured), 6) == (50, 1, 7, 90, 100, 99)
     # 60 was never heard; who is named twice counts once.
-    assert group.contributors((60, 50, 3, 3), 3) == (50, 3, 100)
-    assert len(group.contributors((), 8)) == 8
-    assert len(group.contributors((), 1000)) == 99
+    assert group.maps.contributors((60, 50, 3, 3), 3) == (50, 3, 100)
+    assert len(group.maps.contributors((), 8)) == 8
+    assert len(group.maps.contributors((), 1000)) == 99
 
 
 def test_peers_join_once_are_lost_after_the_timeout_and_come_back() -> None:
@@ -126,35 +126,35 @@ def test_a_configured_leader_coordinates() -> None:
 def test_who_lacks_the_newest_map() -> None:
     group = Group(THREE, 1)
     group.heartbeat(2, 0.0)
-    assert group.lacking() == ()  # there is none yet
+    assert group.maps.lacking() == ()  # there is none yet
     group.set_own_state(OLD)
-    assert group.lacking() == (2,)
+    assert group.maps.lacking() == (2,)
     assert group.map_state(3, OLD, 0.0) == [PeerJoined(3)]
     group.map_state(2, OLD, 0.0)
-    assert group.lacking() == ()
+    assert group.maps.lacking() == ()
     group.set_own_state(NEW)
-    assert group.newest_revision == NEW.revision
-    assert group.lacking() == (2, 3)
+    assert group.maps.newest_revision == NEW.revision
+    assert group.maps.lacking() == (2, 3)
     group.map_state(3, NEW, 1.0)
-    assert group.holders(NEW.revision) == (1, 3)
-    assert group.lacking() == (2,)
+    assert group.maps.holders(NEW.revision) == (1, 3)
+    assert group.maps.lacking() == (2,)
     group.poll(5.0)  # 2 is lost
-    assert group.lacking() == ()
+    assert group.maps.lacking() == ()
     group.map_state(3, NEW, 5.0)
     group.heartbeat(2, 6.0)  # back, perhaps restarted: what it had is not believed
     assert group.state_of(2) is None
-    assert group.lacking() == (2,)
+    assert group.maps.lacking() == (2,)
 
 
 def test_a_member_knows_the_newest_map_from_the_coordinator() -> None:
     group = Group(THREE, 3)
     group.set_own_state(OLD)
-    assert group.newest_revision == b""
-    assert not group.is_map_coming
+    assert group.maps.newest_revision == b""
+    assert not group.maps.is_map_coming
     group.map_state(1, NEW, 0.0)
-    assert group.newest_revision == NEW.revision
-    assert group.lacking() == (3,)
-    assert group.is_map_coming
+    assert group.maps.newest_revision == NEW.revision
+    assert group.maps.lacking() == (3,)
+    assert group.maps.is_map_coming
 
 
 def test_who_is_not_believed_is_there_but_counts_for_nothing() -> None:
@@ -165,14 +165,14 @@ def test_who_is_not_believed_is_there_but_counts_for_nothing() -> None:
         group.map_state(peer, wants, 0.0)
     group.distrust(frozenset({1, 4}))  # never ourselves
     assert (group.alive, group.trusted) == ((1, 2, 3, 4), (1, 2, 3))
-    assert group.wanting_update == (1, 2, 3)
-    assert group.holders(wants.revision) == (1, 2, 3, 4)
+    assert group.maps.wanting_update == (1, 2, 3)
+    assert group.maps.holders(wants.revision) == (1, 2, 3, 4)
     for peer in (3, 4):
         group.map_state(peer, OLD, 1.0)
-    assert group.lacking() == (3,)
+    assert group.maps.lacking() == (3,)
     group.distrust(frozenset())
     assert group.trusted == group.alive
-    assert group.lacking() == (3, 4)
+    assert group.maps.lacking() == (3, 4)
 
 
 def test_our_map_goes_on_without_those_whose_own_is_about_to_be_merged_into_it() -> None:
@@ -180,24 +180,24 @@ def test_our_map_goes_on_without_those_whose_own_is_about_to_be_merged_into_it()
     group.set_own_state(MapState(NEW.revision, 1000, True, wants_update=True))
     for peer in (2, 3):
         group.map_state(peer, OLD, 0.0)
-    assert (group.lacking(), group.majority_wants_update) == ((2, 3), False)
+    assert (group.maps.lacking(), group.maps.majority_wants_update) == ((2, 3), False)
     group.leave_apart(frozenset({1, 2, 3}))  # never ourselves
-    assert (group.lacking(), group.majority_wants_update) == ((), True)
-    assert group.contributors((2,), 3) == (1,)
+    assert (group.maps.lacking(), group.maps.majority_wants_update) == ((), True)
+    assert group.maps.contributors((2,), 3) == (1,)
     assert group.trusted_teammates == (1, 2, 3)
     group.leave_apart(frozenset())
-    assert (group.lacking(), group.majority_wants_update) == ((2, 3), False)
+    assert (group.maps.lacking(), group.maps.majority_wants_update) == ((2, 3), False)
 
 
 def test_others_outvote_us_when_most_of_them_and_two_at_least_hold_a_map() -> None:
     group = Group(SwarmOptions((1, 2, 3, 4)), 1)
     group.map_state(2, NEW, 0.0)
-    assert not group.most_others_hold(NEW.revision)  # one word
+    assert not group.maps.most_others_hold(NEW.revision)  # one word
     group.map_state(3, NEW, 0.0)
     group.map_state(4, OLD, 0.0)
-    assert group.most_others_hold(NEW.revision)
+    assert group.maps.most_others_hold(NEW.revision)
     group.distrust(frozenset({3}))
-    assert not group.most_others_hold(NEW.revision)
+    assert not group.maps.most_others_hold(NEW.revision)
 
 
 @given(st.lists(st.tuples(st.integers(1, 4), st.floats(0.0, 100.0)), max_size=40))
@@ -291,7 +291,7 @@ def test_who_was_asked_all_the_time_says_the_same_as_who_was_never_asked(
                     group.poll(now_s)
         found_out(often)
     assert found_out(often) == found_out(once)
-    assert once.is_map_coming == (once.own_id in once.lacking())
+    assert once.maps.is_map_coming == (once.own_id in once.maps.lacking())
 
 
 def found_out(group: Group) -> tuple[object, ...]:
@@ -301,9 +301,9 @@ def found_out(group: Group) -> tuple[object, ...]:
         group.teammates,
         group.other_teams,
         group.coordinator,
-        group.lacking(),
-        group.wanting_update,
-        group.majority_wants_update,
-        group.contributors((), 4),
+        group.maps.lacking(),
+        group.maps.wanting_update,
+        group.maps.majority_wants_update,
+        group.maps.contributors((), 4),
         group.is_senior(1),
     )

@@ -38,11 +38,17 @@ class Air:
         """Have a drone tell its state now."""
         group = self.groups[own]
         state = MapState(
-            MAP.revision, 900, True, 100, team=group.team, epoch=group.epoch, world=MAP.world
+            MAP.revision,
+            900,
+            True,
+            100,
+            team=group.team,
+            epoch=group.leadership.epoch,
+            world=MAP.world,
         )
         group.set_own_state(state)
         self._told_at_s[own] = self.now_s
-        self._lead[own] = group.team, group.own_epoch
+        self._lead[own] = group.team, group.leadership.own_epoch
         for receiver in self._receivers(own):
             receiver.map_state(own, state, self.now_s)
 
@@ -63,7 +69,7 @@ class Air:
             self._beat_at_s[own] = self.now_s
             for receiver in self._receivers(own):
                 receiver.heartbeat(own, self.now_s)
-        has_led = (group.team, group.own_epoch) != self._lead[own]
+        has_led = (group.team, group.leadership.own_epoch) != self._lead[own]
         if has_led or self.now_s >= self._told_at_s[own] + max(2.0, group.stretch):
             self.tell(own)
 
@@ -175,10 +181,10 @@ def test_who_may_be_lost_is_waited_for_by_nobody_and_asked_last() -> None:
     hosts.answered(3, 0.001, 1.0, 0)
     hosts.answered(4, 0.1, 1.0, 0)
     group.poll(7.7)
-    assert group.lacking() == (2,)
+    assert group.maps.lacking() == (2,)
     assert hosts.choose(MAP.revision, 1) == [3]
     group.poll(7.8)
-    assert group.lacking() == ()
+    assert group.maps.lacking() == ()
     assert group.alive == (1, 2, 3, 4)
     assert hosts.choose(MAP.revision, 1) == [4]
     assert hosts.choose(MAP.revision, 2) == [4, 3]

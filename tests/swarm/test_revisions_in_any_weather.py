@@ -96,7 +96,7 @@ class Revisions(RuleBasedStateMachine):
             return
         self.group.set_own_state(MapState(revision_of(self.newest), 0, True))
         giver = self.network.drones[1]
-        holders = self.group.holders(revision_of(self.newest))
+        holders = self.group.maps.holders(revision_of(self.newest))
         for peer in [member for member in MEMBERS if member not in holders]:
             blob, sent_id = self.handed.get(peer, (b"", 0))
             if blob and blob != self.newest:

@@ -51,12 +51,12 @@ def test_at_the_end_of_all_epochs_nobody_is_fenced_for_ever() -> None:
     group.map_state(3, state(epoch=MAX_EPOCH), 4.0)
     group.poll(5.0)
     # The first one comes again, and is above the last.
-    assert (group.coordinator, group.epoch) == (2, 0x102)
-    assert group.may_lead(2)
+    assert (group.coordinator, group.leadership.epoch) == (2, 0x102)
+    assert group.leadership.may_lead(2)
     group.map_state(1, state(), 6.0)
     assert group.coordinator == 1
-    assert group.is_fenced(1)
-    assert not group.may_lead(1)
+    assert group.leadership.is_fenced(1)
+    assert not group.leadership.may_lead(1)
 
 
 @given(known=st.integers(0, MAX_EPOCH), told=st.integers(0, MAX_EPOCH), own=st.integers(1, 250))
@@ -80,8 +80,8 @@ def test_while_nobody_was_lost_there_is_one_team_under_the_first_epoch() -> None
     sky = Sky(FIVE)
     sky.run(60.0)
     assert set(sky.leads().values()) == {(0, 1)}
-    assert {group.epoch for group in sky.up.values()} == {FIRST}
-    assert all(group.may_lead(1) for group in sky.up.values())
+    assert {group.leadership.epoch for group in sky.up.values()} == {FIRST}
+    assert all(group.leadership.may_lead(1) for group in sky.up.values())
 
 
 def test_who_takes_a_lost_leaders_place_does_so_under_a_newer_epoch() -> None:
@@ -90,15 +90,15 @@ def test_who_takes_a_lost_leaders_place_does_so_under_a_newer_epoch() -> None:
     sky.stop(1)
     sky.run(10.0)
     assert set(sky.leads().values()) == {(0, 2)}
-    taken = sky.up[2].own_epoch
+    taken = sky.up[2].leadership.own_epoch
     assert taken > VACANT
-    assert {group.epoch for group in sky.up.values()} == {taken}
+    assert {group.leadership.epoch for group in sky.up.values()} == {taken}
     sky.start(1)
     sky.run(10.0)
     assert set(sky.leads().values()) == {(0, 1)}
-    assert sky.up[1].own_epoch > taken
-    assert sky.up[2].own_epoch == 0
-    assert all(group.may_lead(1) for group in sky.up.values())
+    assert sky.up[1].leadership.own_epoch > taken
+    assert sky.up[2].leadership.own_epoch == 0
+    assert all(group.leadership.may_lead(1) for group in sky.up.values())
 
 
 def test_a_coordinator_that_was_away_is_fenced_until_it_has_heard_of_it() -> None:
@@ -108,14 +108,14 @@ def test_a_coordinator_that_was_away_is_fenced_until_it_has_heard_of_it() -> Non
     group.map_state(2, state(epoch=0x102), 6.0)
     group.poll(6.0)
     assert group.coordinator == 2
-    assert group.may_lead(2)
-    assert not group.may_lead(1)
+    assert group.leadership.may_lead(2)
+    assert not group.leadership.may_lead(1)
     group.map_state(1, state(), 7.0)  # it is back, and has not heard yet
     assert group.coordinator == 1
-    assert group.is_fenced(1)
-    assert not group.may_lead(1)
+    assert group.leadership.is_fenced(1)
+    assert not group.leadership.may_lead(1)
     group.map_state(1, state(epoch=0x201), 8.0)
-    assert group.may_lead(1)
+    assert group.leadership.may_lead(1)
 
 
 def test_a_restarted_drone_waits_before_it_holds_the_leader_for_lost() -> None:
@@ -127,7 +127,7 @@ def test_a_restarted_drone_waits_before_it_holds_the_leader_for_lost() -> None:
     group.map_state(4, state(epoch=0x104), 4.9)
     group.poll(5.0)
     assert group.is_coordinator
-    assert group.own_epoch > 0x104
+    assert group.leadership.own_epoch > 0x104
 
 
 def test_one_who_never_heard_the_leader_learns_that_it_was_lost() -> None:
@@ -147,9 +147,9 @@ def test_who_sees_nothing_of_the_coordinators_place_leaves_together_and_comes_ba
     sky.run(30.0)
     assert sky.teams() == {frozenset((1, 2)), frozenset((3, 4, 5))}
     assert sky.leads()[4] == sky.leads()[5] == (3, 3)
-    assert sky.up[3].own_epoch == sky.up[5].epoch > FIRST
+    assert sky.up[3].leadership.own_epoch == sky.up[5].leadership.epoch > FIRST
     assert sky.up[1].other_teams == (3,)
-    assert sky.up[4].coordinator_of(0) == 1
+    assert sky.up[4].leadership.coordinator_of(0) == 1
     assert sky.up[4].is_senior(0)
     assert not sky.up[1].is_senior(3)
     sky.place |= {2: 8, 1: 0}  # one of ours sees what they see
@@ -202,12 +202,12 @@ def test_questions_are_about_our_own_team() -> None:
     group.heartbeat(5, 0.0)
     assert group.teammates == (1, 2, 5)
     assert group.alive == FIVE.members
-    assert group.holders(b"revision") == (1, 2)
-    assert group.wanting_update == (2,)
-    assert not group.majority_wants_update
-    assert group.lacking() == (5,)
-    assert set(group.contributors((3, 4), 9)) == {1, 2, 5}
-    assert not group.most_others_hold(b"revision")
+    assert group.maps.holders(b"revision") == (1, 2)
+    assert group.maps.wanting_update == (2,)
+    assert not group.maps.majority_wants_update
+    assert group.maps.lacking() == (5,)
+    assert set(group.maps.contributors((3, 4), 9)) == {1, 2, 5}
+    assert not group.maps.most_others_hold(b"revision")
 
 
 def test_who_is_not_believed_moves_nobody() -> None:
@@ -216,7 +216,7 @@ def test_who_is_not_believed_moves_nobody() -> None:
     group.distrust(frozenset({1, 2}))
     group.map_state(1, state(), 0.0)
     group.map_state(2, state(epoch=0x702), 0.0)
-    assert group.epoch == FIRST
+    assert group.leadership.epoch == FIRST
     group.map_state(1, state(team=7, epoch=0x901), 1.0)
     assert group.team == 0
 
@@ -279,12 +279,13 @@ def test_whatever_happens_teams_agree_in_the_end(
         others = {before[other][1] for other in before if before[other][0] == team}
         assert others == {coordinator}, f"{member} of {before}"
     epochs = {
-        team: {g.epoch for g in sky.up.values() if g.team == team} for team, _ in before.values()
+        team: {g.leadership.epoch for g in sky.up.values() if g.team == team}
+        for team, _ in before.values()
     }
     assert all(len(known) == 1 for known in epochs.values())
     for group in sky.up.values():
         if group.coordinator in sky.up:
-            assert group.may_lead(group.coordinator)
+            assert group.leadership.may_lead(group.coordinator)
     sky.place = dict.fromkeys(FIVE.members, 1)
     sky.run(3 * QUIET_S)
     assert len(sky.teams()) <= 1
@@ -300,10 +301,10 @@ def test_members_follow_their_coordinator_to_a_senior_team_at_once() -> None:
     assert group.team == 3
     group.map_state(3, state(team=0, revision=b""), 1.0)  # restarted, it went nowhere
     assert group.team == 3
-    group.map_state(3, state(team=3, epoch=group.epoch), 2.0)
+    group.map_state(3, state(team=3, epoch=group.leadership.epoch), 2.0)
     group.map_state(3, state(team=4, epoch=0x904), 3.0)  # not a senior one
     assert group.team == 3
-    group.map_state(3, state(team=3, epoch=group.epoch), 4.0)
+    group.map_state(3, state(team=3, epoch=group.leadership.epoch), 4.0)
     group.map_state(3, state(team=0), 5.0)
     assert group.team == 0
 

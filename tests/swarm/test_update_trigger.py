@@ -108,8 +108,8 @@ class Sky:
     def _step(self, own_id: int, member: Member) -> None:
         member.group.poll(self.now_s)
         group = member.group
-        is_coming = own_id in group.lacking()
-        member.vote.follow(member.revision, group.majority_wants_update, is_coming, self.now_s)
+        is_coming = own_id in group.maps.lacking()
+        member.vote.follow(member.revision, group.maps.majority_wants_update, is_coming, self.now_s)
         wants = member.vote.look(member.revision, Sight(member.tracked), self.now_s)
         before = member.group.state_of(own_id)
         state = MapState(member.revision, 0, member.tracked > 0, member.tracked, wants)
@@ -256,7 +256,7 @@ def test_a_vote_about_another_revision_does_not_count() -> None:
     sky.members[2].revision = sky.members[3].revision = SECOND
     sky.see(FEW, 2, 3)
     sky.run(60.0)
-    assert sky.members[1].group.wanting_update == ()
+    assert sky.members[1].group.maps.wanting_update == ()
     assert sky.begun == []
 
 

@@ -37,4 +37,4 @@ class AnswerHearers:
         hears = group.trusted_teammates if self._transfers.shares_network else ()
         is_first = self._maps.current is None
         others = [peer for peer in hears if peer not in (asker, group.own_id)]
-        return [peer for peer in others if is_first or group.has_map(peer)]
+        return [peer for peer in others if is_first or group.maps.has_map(peer)]

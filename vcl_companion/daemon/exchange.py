@@ -352,7 +352,7 @@ class Exchange:
         return (
             self._rounds.is_coming
             or self._sharing.merging.is_under_way
-            or bool(self._group.lacking())
+            or bool(self._group.maps.lacking())
             or self._own_state.is_undecided(now_s)
         )
 

@@ -76,7 +76,9 @@ class FirstMapTurn:
             return True
         now_s = asyncio.get_running_loop().time()
         group = self._group
-        claiming = frozenset(p for p in group.trusted if p != group.own_id and group.has_map(p))
+        claiming = frozenset(
+            p for p in group.trusted if p != group.own_id and group.maps.has_map(p)
+        )
         for peer in claiming & self._claiming:
             self._claimed_s[peer] += now_s - self._looked_at_s
         for peer in claiming - self._claiming:

@@ -134,7 +134,7 @@ class MapBranches:
             return None
         if group.is_coordinator:
             seniors = [team for team in group.teams_met if group.is_senior(team)]
-            return group.coordinator_of(seniors[0]) if seniors else None
+            return group.leadership.coordinator_of(seniors[0]) if seniors else None
         coordinator = group.coordinator
         self._note_holders(current.revision)
         state = group.state_of(coordinator)
@@ -148,7 +148,7 @@ class MapBranches:
             return None
         if self._giver_hands(state.revision):
             return None
-        is_first_holder = group.holders(current.revision)[:1] == (group.own_id,)
+        is_first_holder = group.maps.holders(current.revision)[:1] == (group.own_id,)
         return coordinator if is_first_holder else None
 
     def _giver_hands(self, revision: bytes) -> bool:
@@ -166,7 +166,7 @@ class MapBranches:
         """Remember who has had our map, as long as it is in use here."""
         if self._had_ours[0] != revision:
             self._had_ours = revision, set()
-        self._had_ours[1].update(self._group.holders(revision))
+        self._had_ours[1].update(self._group.maps.holders(revision))
 
     def joining(self) -> tuple[int, ...]:
         """Return the other teams' coordinators whose map ours has in it, to be handed ours."""
@@ -194,14 +194,14 @@ class MapBranches:
         """Whether a peer coordinates a team that ours may join."""
         team = self._group.team_of(peer)
         is_other = team != self._group.team and self._group.is_senior(team)
-        return is_other and self._group.coordinator_of(team) == peer
+        return is_other and self._group.leadership.coordinator_of(team) == peer
 
     def _is_of_junior_team(self, peer: int) -> bool:
         team = self._group.team_of(peer)
         return (
             team in self._group.teams_met
             and not self._group.is_senior(team)
-            and self._group.coordinator_of(team) == peer
+            and self._group.leadership.coordinator_of(team) == peer
         )
 
     def _is_foreign(self, revision: bytes) -> bool:

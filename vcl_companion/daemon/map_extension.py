@@ -157,7 +157,7 @@ class MapExtension:
         where the map has nothing.
         """
         until_s = self._now_s() + _JUDGED_S
-        while not (is_wanted := self._group.majority_wants_update) and self._now_s() < until_s:
+        while not (is_wanted := self._group.maps.majority_wants_update) and self._now_s() < until_s:
             if self.is_past(stored):
                 break
             await asyncio.sleep(look_s(self._group.stretch))

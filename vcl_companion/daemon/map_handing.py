@@ -149,7 +149,7 @@ class MapHanding:
             if self._group.state_of(peer) is None:
                 continue  # it is about to say what it has, perhaps a map of a world of its own
             is_on_part = self._is_on_part(peer)
-            if not self._group.has_map(peer) and self._parts.comes_first(
+            if not self._group.maps.has_map(peer) and self._parts.comes_first(
                 peer, stored, is_on_part=is_on_part
             ):
                 continue
@@ -161,7 +161,7 @@ class MapHanding:
     def _is_on_part(self, peer: int) -> bool:
         """Whether a peer without a map flies on a part of one."""
         state = self._group.state_of(peer)
-        return state is not None and state.n_landmarks > 0 and not self._group.has_map(peer)
+        return state is not None and state.n_landmarks > 0 and not self._group.maps.has_map(peer)
 
     def _abandon_all_but(self, revision: bytes) -> None:
         """Stop sending maps that a newer one has replaced, to who is away at the moment as well.
@@ -199,7 +199,7 @@ class MapHanding:
 
         None while an image of the map is still on its way there, or it is still being made.
         """
-        if n_delivered == 0 and not self._group.has_map(peer):
+        if n_delivered == 0 and not self._group.maps.has_map(peer):
             is_on_part = self._is_on_part(peer)
             rest = self._parts.rest_for(peer, stored, self._now_s(), is_on_part=is_on_part)
             if rest is None:
@@ -227,7 +227,7 @@ class MapHanding:
 
         Without the images that it has with its own, unless that was in vain.
         """
-        may_hold = n_delivered == 0 and self._group.has_map(peer)
+        may_hold = n_delivered == 0 and self._group.maps.has_map(peer)
         held = self._branches.held_by(peer) if may_hold else frozenset[bytes]()
         standalone = self._standalone.without(stored, held)
         if standalone is None:
@@ -237,14 +237,14 @@ class MapHanding:
     def _lacking(self, revision: bytes) -> list[int]:
         group = self._group
         if group.is_coordinator:
-            there = {group.own_id, *group.holders(revision)}
+            there = {group.own_id, *group.maps.holders(revision)}
             return [peer for peer in group.teammates if peer not in there]
         state = group.state_of(group.coordinator)
         if self._was_given_lately(group.coordinator, revision):
             return []
         if state is None or (state.revision and not self.has_been_behind(_FOLLOWS_S)):
             return []
-        is_first_holder = group.holders(revision)[:1] == (group.own_id,)
+        is_first_holder = group.maps.holders(revision)[:1] == (group.own_id,)
         return [group.coordinator] if is_first_holder else []
 
     def _was_given_lately(self, peer: int, revision: bytes) -> bool:

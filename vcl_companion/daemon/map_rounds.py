@@ -216,7 +216,7 @@ class MapRounds:
         # The leader's body is the world's origin, ours where there is none; without a known
         # distance there is no scale.
         origin = group.leader if group.leader in group.teammates else group.own_id
-        contributors = group.contributors(
+        contributors = group.maps.contributors(
             (origin, *group.measured), self._options.update.contributors
         )
         wanted = Wanted(
@@ -242,7 +242,7 @@ class MapRounds:
         """Make an update; return whether it was made of places that are new to the map."""
         update = self._options.update
         lost = self._trigger.lost(self._now_s())
-        reason = f"wanted by drones {_listed(self._group.wanting_update)}"
+        reason = f"wanted by drones {_listed(self._group.maps.wanting_update)}"
         reason += " and the ground" if self.is_asked else ""
         reason += f"; {_listed(lost)} lost" if lost else ""
         self._log.event("update", reason)
@@ -277,7 +277,7 @@ class MapRounds:
         they are held by what is known, and of views that are alike two suffice.
         """
         group, most = self._group, self._options.update.contributors
-        members = group.contributors((*lost, *group.wanting_update), len(group.members))
+        members = group.maps.contributors((*lost, *group.maps.wanting_update), len(group.members))
         if len(members) > 2 and await self._detail(frame) == "coarse":
             blind = [m for m in members if not self._sees_enough(m)]
             members = without_alike(members, stored.index.landmark_map, (*lost, *blind))

@@ -236,7 +236,7 @@ class MapSharing:
         says nothing new of the peer. Nor does one of another world that ours is not joined with,
         though a third part of the swarm has brought it keyframes of ours: there they lie elsewhere.
         """
-        if not ready.contradicts or self._group.most_others_hold(offer.revision):
+        if not ready.contradicts or self._group.maps.most_others_hold(offer.revision):
             self._trust.note(peer, Evidence.MAP_TAKEN)
             return False
         current = self._maps.current
@@ -268,7 +268,7 @@ class MapSharing:
         if current.part_of:
             return None
         if group.is_coordinator:
-            holders = group.holders(offer.revision)
+            holders = group.maps.holders(offer.revision)
             trusted = group.trusted_teammates
             n_holders = sum(member in trusted for member in holders)
             if 2 * n_holders > len(trusted) or offer.parent == current.revision:
@@ -279,7 +279,7 @@ class MapSharing:
             if offer.parent == current.revision and self._branches.goes_on_by(peer, self._now_s()):
                 return None
             return "map, but not from the coordinator"
-        if not group.may_lead(peer):
+        if not group.leadership.may_lead(peer):
             return "map of a coordinator that was away"
         if self._maps.has_left(offer.revision) and not self.handing.has_been_behind(
             self._delivery_wait_s

@@ -95,7 +95,7 @@ class MapUse:
         current = self._maps.current
         if current is None or current.revision != revision:
             return
-        if self._group.wanting_update:
+        if self._group.maps.wanting_update:
             # It is about to be replaced, and the next one wants the processor now.
             asyncio.get_running_loop().call_later(_STAYS_S, self._want_more_of, revision)
             return
@@ -137,7 +137,7 @@ class MapUse:
         Where somebody is lost, ourselves or who wants it, the index may be what finds them.
         """
         group = self._group
-        members = {group.own_id, *group.wanting_update}
+        members = {group.own_id, *group.maps.wanting_update}
         states = [state for m in members if (state := group.state_of(m)) is not None]
-        is_coming = bool(group.wanting_update) or group.is_map_coming
+        is_coming = bool(group.maps.wanting_update) or group.maps.is_map_coming
         return is_coming and all(state.localized for state in states)

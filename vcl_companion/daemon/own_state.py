@@ -87,7 +87,7 @@ class OwnState:
     def poll(self, now_s: float) -> None:
         """Look at what we see, and tell our state if it is time."""
         interval_s = _TO_NEW_S if self._has_joined else self._interval_s(now_s)
-        lead = self._group.team, self._group.own_epoch
+        lead = self._group.team, self._group.leadership.own_epoch
         if lead[0] != self._told_lead[0]:
             self._log.event("team", f"of drone {lead[0]}" if lead[0] else "of all")
         is_due = now_s - self._told_at_s >= interval_s
@@ -112,7 +112,7 @@ class OwnState:
             min(self._estimator.in_sight.tracked, MAX_TRACKED),
             self._wants_update,
             self._group.team,
-            self._group.epoch,
+            self._group.leadership.epoch,
             world=stored.world if stored and stored.told_revision else b"",
             signature=self._group.signature_to_tell(now_s),
         )
@@ -129,8 +129,8 @@ class OwnState:
         seen = self._estimator.in_sight
         revision = stored.revision if stored else b""
         group = self._group
-        is_coming = group.is_map_coming
-        self._vote.follow(revision, group.majority_wants_update, is_coming, now_s)
+        is_coming = group.maps.is_map_coming
+        self._vote.follow(revision, group.maps.majority_wants_update, is_coming, now_s)
         if stored is not None and seen.seen_on != stored.revision:
             self._wants_update = self._vote.unseen()
             return self._wants_update != before

@@ -87,7 +87,9 @@ class PeerMessages:
                 # Most say what was said before, and in a large swarm that would be all the work.
                 return self._presence.map_state(peer, message)
             case FrameRequest():
-                if not self._answers.want(peer, message, leads=self._group.may_lead(peer)):
+                if not self._answers.want(
+                    peer, message, leads=self._group.leadership.may_lead(peer)
+                ):
                     self._refusals.count(peer, "frames asked for too often for no coordinator")
                     return False
             case MapRefused():

@@ -36,13 +36,13 @@ class Awaited:
             now_s: not before the last call's.
         """
         group = self._group
-        if group.newest_revision != self._revision:
-            self._revision = group.newest_revision
+        if group.maps.newest_revision != self._revision:
+            self._revision = group.maps.newest_revision
             self._lacks_since_s.clear()
-        lacking = group.lacking()
+        lacking = group.maps.lacking()
         alive = set(group.alive)
         # Who may be lost (``Group.is_silent``) lacks it yet, if it comes back.
-        kept = alive.difference(group.holders(self._revision))
+        kept = alive.difference(group.maps.holders(self._revision))
         self._lacks_since_s = {m: s for m, s in self._lacks_since_s.items() if m in kept}
         until_s = now_s - _ONCE_MORE * self._patience_s
         self._late_since_s = {

@@ -185,7 +185,7 @@ class HostChoice:
         group = self._group
         return [
             peer
-            for peer in group.holders(revision)
+            for peer in group.maps.holders(revision)
             if peer != group.own_id
             and peer in group.trusted
             and (state := group.state_of(peer))

@@ -93,16 +93,16 @@ class UpdateTrigger:
     def poll(self, now_s: float) -> None:
         """Look at the group; call it several times a second."""
         group = self._group
-        if group.newest_revision != self._revision:
-            self._revision, self._revision_since_s = group.newest_revision, now_s
+        if group.maps.newest_revision != self._revision:
+            self._revision, self._revision_since_s = group.maps.newest_revision, now_s
             self._n_on_this = 0
-        if not group.majority_wants_update:
+        if not group.maps.majority_wants_update:
             self._wanted_since_s = None
         elif self._wanted_since_s is None:
             self._wanted_since_s = now_s
         # Who does not have the newest revision has not judged it.
         awaited = self._awaited.look(now_s)  # at every look: it counts for how long
-        if group.majority_wants_update or awaited:
+        if group.maps.majority_wants_update or awaited:
             self._content_since_s = math.inf
         else:
             self._content_since_s = min(self._content_since_s, now_s)
@@ -113,7 +113,9 @@ class UpdateTrigger:
             self._revision, self._options.tracked
         ):
             self._n_in_vain, self._helped = 0, self._revision
-        lost = [m for m in group.holders(self._revision) if self._revision and self._is_lost(m)]
+        lost = [
+            m for m in group.maps.holders(self._revision) if self._revision and self._is_lost(m)
+        ]
         self._lost_since_s = {m: self._lost_since_s.get(m, now_s) for m in lost}
 
     def is_due(self, now_s: float) -> bool:
