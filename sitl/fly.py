@@ -16,12 +16,13 @@ import numpy as np
 
 from sitl.absences import seconds_late
 from sitl.daemon_config import check_settings
+from sitl.gathered import gather
 from sitl.out_folder import files_in_one_line, prepare_folder
 from sitl.pacing import Instant, Pace, gate, instants
 from sitl.plan import FlightPlan, FlyOptions, plan_flight
 from sitl.processes import FlightError, unless_one_ends
 from sitl.report import write_report
-from sitl.result import Event, gather
+from sitl.result import Event
 from sitl.shots import RecordedShots, Shots
 from sitl.swarm import Swarm
 from sitl.trajectory_files import write_trajectories

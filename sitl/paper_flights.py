@@ -15,11 +15,12 @@ from typing import Any
 
 from sitl import paper_fingerprint
 from sitl.fly import Progress, fly
+from sitl.gathered import gather
 from sitl.paper_estimates import SourceEstimates, by_source
 from sitl.paper_experiments import Experiment, Pipeline
 from sitl.paper_recordings import Rendered
 from sitl.plan import FlyOptions, plan_flight
-from sitl.result import DroneResult, FlightResult, gather
+from sitl.result import DroneResult, FlightResult
 from vcl_companion.recording import read_recording
 
 _FINGERPRINT = Path("run") / "fingerprint.json"

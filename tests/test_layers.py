@@ -34,6 +34,7 @@ HEIGHT = {room: height for height, shelf in enumerate(SHELVES) for room in shelf
 # Foreign modules that only some files may import; a trailing slash is a folder.
 CONFINED = {
     "pymavlink": (
+        f"{PACKAGE}/links/decoding.py",
         f"{PACKAGE}/links/mavlink.py",
         f"{PACKAGE}/links/own_messages.py",
         f"{PACKAGE}/links/signing.py",

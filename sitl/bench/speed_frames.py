@@ -21,7 +21,8 @@ from vcl_companion.localization.pipeline import PipelineOptions, localize
 from vcl_companion.localization.tracking import TrackingOptions
 from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.swarm.transfer import BlobKind
-from vcl_companion.vision.patches import choose_anchors, lens_of
+from vcl_companion.vision.patch_choice import choose_anchors
+from vcl_companion.vision.patch_tables import lens_of
 from vcl_companion.wire.map_codec import encode_map
 
 OPTIONS = PipelineOptions(FEATURES, LocalizationOptions(), TrackingOptions())

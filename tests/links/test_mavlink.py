@@ -8,8 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.links import wire
+from vcl_companion.clock import system_moment
 from vcl_companion.geometry.rotation import matrix_from_euler, matrix_from_quaternion
 from vcl_companion.links.counters import LinkTally
+from vcl_companion.links.decoding import Decoder
 from vcl_companion.links.mavlink import Codec
 from vcl_companion.links.messages import (
     AttitudeSample,
@@ -214,12 +216,13 @@ def test_a_stream_is_the_same_however_it_is_cut(cuts: list[int], garbage: bytes)
 
 @given(st.binary(max_size=600))
 def test_any_bytes_are_survived(data: bytes) -> None:
-    ours, tally = codec()
-    ours.decode_datagram(data)
-    ours.decode_stream(data)
-    assert len(ours._rest) <= 280
+    tally = LinkTally()
+    ours = Decoder((1, 197), tally, None, system_moment)
+    ours.datagram(data)
+    ours.stream(data)
+    assert len(ours.unfinished) <= 280
     # Whatever stood before it, a frame and enough bytes after it bring the stream back.
-    messages = ours.decode_stream(wire.heartbeat() * 40)
+    messages = ours.stream(wire.heartbeat() * 40)
     assert messages
     assert tally.snapshot().bytes_in == 0
 

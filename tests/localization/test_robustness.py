@@ -28,7 +28,7 @@ from vcl_companion.localization.tracking import TrackingOptions, track
 from vcl_companion.mapping.templates import Templates, prepare_templates
 from vcl_companion.mapping.uncertainty import map_uncertainty
 from vcl_companion.vision.features import FeatureOptions, Image, detect
-from vcl_companion.vision.patches import KeyframeImages
+from vcl_companion.vision.patch_tables import KeyframeImages
 
 OPTIONS, BELIEF = TrackingOptions(), LocalizationOptions()
 TRUTH = Pose(exp_so3(np.array([0.03, 0.02, -0.05])), np.array([-2.5, 0.8, -0.4]))

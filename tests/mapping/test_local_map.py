@@ -24,7 +24,7 @@ from vcl_companion.mapping.view_adjustment import (
     relative_map,
 )
 from vcl_companion.vision.features import FeatureOptions, detect
-from vcl_companion.vision.patches import pyramid_of
+from vcl_companion.vision.patch_tables import pyramid_of
 
 SCENE = SceneDepth(1 / 40.0, 1 / 3.0, 1 / 13.0, 0.7, 0.7)
 NO_PARTS = SCENE.parts(np.zeros((0, 2)), PINHOLE)

@@ -21,9 +21,10 @@ from sitl.absences import (
     parse_late,
 )
 from sitl.frame_server import FrameServer
+from sitl.gathered import gather
 from sitl.lives import Life, Lives, log_path, write_lives
 from sitl.report import report_of, write_report
-from sitl.result import FlightResult, gather
+from sitl.result import FlightResult
 from tests.sitl.flights import PERIOD_NS, START_NS, Flight, leave_behind
 from tests.sitl.test_frame_server import png, soon
 from vcl_companion.cameras.stream import Answer, encode_answer

@@ -20,6 +20,7 @@ from click.testing import CliRunner
 from sitl import paper_fingerprint
 from sitl.__main__ import main
 from sitl.evaluation import upper_from_covariance
+from sitl.gathered import gather
 from sitl.goals import Goal
 from sitl.paper import PaperResult, paper_json
 from sitl.paper_estimates import by_source
@@ -43,7 +44,6 @@ from sitl.paper_recordings import Rendered, rendered
 from sitl.plan import FlyOptions, Setting, pipeline_of
 from sitl.processes import FlightError
 from sitl.report import report_of
-from sitl.result import gather
 from sitl.scenario import Scenario, load_scenario
 from tests.sitl.flights import NED_FROM_WORLD, ErrorOf, Flight, at_ns, leave_behind, ned_from_body
 from vcl_companion.errors import ConfigError

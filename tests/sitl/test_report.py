@@ -14,6 +14,7 @@ from rich.console import Console
 from sitl import report_plots
 from sitl.fly import Conduct
 from sitl.fly import reported as conclude
+from sitl.gathered import gather
 from sitl.lives import Life, Lives, write_lives
 from sitl.network import Fate
 from sitl.network_log import NetworkLog
@@ -24,7 +25,7 @@ from sitl.processes import FlightError
 from sitl.recording_axes import sigmas_along_axes
 from sitl.reliance import RELIANCES
 from sitl.report import report_of, write_report
-from sitl.result import FlightResult, gather
+from sitl.result import FlightResult
 from sitl.terminal import show_report
 from sitl.trajectory_files import write_trajectories
 from tests.sitl.flights import (

@@ -14,19 +14,11 @@ from vcl_companion.geometry.camera import Camera
 from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array, exp_so3
 from vcl_companion.vision.features import Image
+from vcl_companion.vision.patch_choice import ChoiceRules, choose_anchors
 from vcl_companion.vision.patch_kernels import FLAT, FOUND, OUTSIDE, UNLIKE
+from vcl_companion.vision.patch_tables import Anchors, keyframe_images, lens_of, pyramid_of
 from vcl_companion.vision.patch_views import bent, seen_from
-from vcl_companion.vision.patches import (
-    Alignment,
-    AlignRules,
-    Anchors,
-    ChoiceRules,
-    align_patches,
-    choose_anchors,
-    keyframe_images,
-    lens_of,
-    pyramid_of,
-)
+from vcl_companion.vision.patches import Alignment, AlignRules, align_patches
 
 RULES = ChoiceRules(40.0, 4.0, 0.05, 0.5, 0.03, 1.5, 3.5)
 

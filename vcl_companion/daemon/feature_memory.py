@@ -17,7 +17,7 @@ from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.keyframe_image import decode_image
 from vcl_companion.mapping.landmark_map import Keyframe
 from vcl_companion.vision.features import Detector, FeatureOptions, Features, detect
-from vcl_companion.vision.patches import Pyramid, pyramid_of
+from vcl_companion.vision.patch_tables import Pyramid, pyramid_of
 
 
 @dataclass(frozen=True, eq=False)

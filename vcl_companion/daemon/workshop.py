@@ -37,7 +37,7 @@ from vcl_companion.recording.sensor import Sensor
 from vcl_companion.swarm.pose_requests import InterMavOptions
 from vcl_companion.vision.features import Detector, FeatureOptions, Image, detect
 from vcl_companion.vision.focus import focused
-from vcl_companion.vision.patches import pyramid_of
+from vcl_companion.vision.patch_tables import pyramid_of
 from vcl_companion.vision.signature import signature_of
 from vcl_companion.wire.frame_codec import FrameAnswer
 from vcl_companion.wire.map_codec import decode_map, encode_map, revision_of

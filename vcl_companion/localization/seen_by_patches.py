@@ -12,12 +12,9 @@ from vcl_companion.mapping.patch_table import EXACTLY
 from vcl_companion.mapping.seen_landmarks import MAX_ASIDE_PX, SeenLandmarks
 from vcl_companion.mapping.templates import Templates
 from vcl_companion.vision.features import Image
-from vcl_companion.vision.patches import (
-    align_patches,
-    choose_anchors,
-    lens_of,
-    pyramid_of,
-)
+from vcl_companion.vision.patch_choice import choose_anchors
+from vcl_companion.vision.patch_tables import lens_of, pyramid_of
+from vcl_companion.vision.patches import align_patches
 
 _MARGIN_PX = 6.0
 

@@ -20,17 +20,9 @@ from vcl_companion.mapping.templates import Templates
 from vcl_companion.options import require_positive
 from vcl_companion.vision.features import Image
 from vcl_companion.vision.information import covariance_of
-from vcl_companion.vision.patches import (
-    Alignment,
-    AlignRules,
-    Anchors,
-    ChoiceRules,
-    Lens,
-    align_patches,
-    choose_anchors,
-    lens_of,
-    pyramid_of,
-)
+from vcl_companion.vision.patch_choice import ChoiceRules, choose_anchors
+from vcl_companion.vision.patch_tables import Anchors, Lens, lens_of, pyramid_of
+from vcl_companion.vision.patches import Alignment, AlignRules, align_patches
 from vcl_companion.vision.pose_errors import gained
 
 _MAX_LEVERAGE = 0.4

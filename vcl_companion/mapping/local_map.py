@@ -29,7 +29,8 @@ from vcl_companion.mapping.view_adjustment import (
     held_by_one,
     relative_map,
 )
-from vcl_companion.vision.patches import AlignRules, Pyramid
+from vcl_companion.vision.patch_tables import Pyramid
+from vcl_companion.vision.patches import AlignRules
 
 # Fewer do not carry a drone on.
 _LEAST_LANDMARKS = 30

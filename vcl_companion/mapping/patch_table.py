@@ -19,16 +19,15 @@ from vcl_companion.geometry.rotation import Array
 from vcl_companion.mapping.keyframe_image import decode_image
 from vcl_companion.mapping.known_features import Index
 from vcl_companion.mapping.surfaces import slopes_of
-from vcl_companion.vision.patches import (
-    AlignRules,
+from vcl_companion.vision.patch_tables import (
     Anchors,
     KeyframeImages,
     Pyramid,
-    align_patches,
     laid_out,
     lens_of,
     pyramid_of,
 )
+from vcl_companion.vision.patches import AlignRules, align_patches
 
 # Patches near where they are known to be: by who extends a map, and who tells what it sees of it.
 EXACTLY = AlignRules(max_iterations=15, least_score=0.85, max_moved_px=1.5, settled_px=0.02)

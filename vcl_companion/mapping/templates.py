@@ -19,7 +19,7 @@ from vcl_companion.mapping.landmark_map import LandmarkMap
 from vcl_companion.mapping.patch_table import PyramidOf, decoded_pyramid
 from vcl_companion.mapping.surfaces import slopes_of
 from vcl_companion.mapping.uncertainty import MapUncertainty
-from vcl_companion.vision.patches import Anchors, keyframe_images
+from vcl_companion.vision.patch_tables import Anchors, keyframe_images
 from vcl_companion.vision.texture import textures
 
 _HALF_PX = 4

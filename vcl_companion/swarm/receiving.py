@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import Counter
 from dataclasses import dataclass, replace
 
 from vcl_companion.errors import WireError
-from vcl_companion.swarm.budget import MAX_FRAME_BYTES, ByteBudget
+from vcl_companion.swarm.owed_answers import MAX_STATUSES, Key, OwedAnswers
 from vcl_companion.swarm.reassembly import (
     CHUNK_COST_BYTES,
     FIXED_COST_BYTES,
@@ -35,17 +34,11 @@ from vcl_companion.wire.chunks import (
     receiving_statuses,
 )
 from vcl_companion.wire.header import BlobKind
-from vcl_companion.wire.tunnel import encode_payload
 
 _MAX_DAMAGED = 3  # whole blobs with a wrong hash before a transfer is refused
-_MAX_STATUSES = 8  # payloads in one answer
 # Remembered finished transfers, of all peers and of one: in 120 s two a second.
 _MAX_SETTLED, _MAX_SETTLED_OF_ONE = 1024, 240
-_MAX_ANSWERS = 64  # answers owed at one time, to one peer
-_QUIET_SHARE = 0.1  # of the status interval: no chunk for this long, and an answer goes out
 _IDLE_SHARE = 0.25  # of the give-up time: silent for this long, and memory may be taken
-# Of the budget, for answers to one peer: who asks all the time shall not have all of it.
-_ANSWERS_SHARE = 0.25
 # A sender that still means a blob asks every five status intervals at the least.
 _SUPERSEDED_INTERVALS = 10.0
 # Of these a sender has one for us at a time, the newest; a map is sent in one form of three.
@@ -56,8 +49,6 @@ _ONE_AT_A_TIME = {
     BlobKind.FRAME_ANSWER: BlobKind.FRAME_ANSWER,
     BlobKind.POSE_REQUEST: BlobKind.POSE_REQUEST,
 }
-
-_Key = tuple[int, int]  # peer, tag
 
 
 @dataclass(frozen=True)
@@ -82,15 +73,6 @@ ReceptionEvent = BlobReceived | ReceptionAbandoned
 
 
 @dataclass(frozen=True)
-class _Answer:
-    """A status owed to a peer."""
-
-    due_s: float
-    asked_at_s: float
-    ask: int
-
-
-@dataclass(frozen=True)
 class _Settled:
     """How a transfer ended here, for chunks that still come."""
 
@@ -104,11 +86,9 @@ class Receptions:
 
     def __init__(self, options: TransferOptions) -> None:
         self._options = options
-        self._incoming: dict[_Key, Incoming] = {}
-        self._settled: dict[_Key, _Settled] = {}
-        self._answers: dict[_Key, _Answer] = {}
-        self._n_owed: Counter[int] = Counter()  # of these, to each peer
-        self._answer_budgets: dict[int, ByteBudget] = {}  # by peer
+        self._incoming: dict[Key, Incoming] = {}
+        self._settled: dict[Key, _Settled] = {}
+        self._answers = OwedAnswers(options.pace)
         self._newest: dict[tuple[int, BlobKind], int] = {}  # tag of what a peer began last
 
     @property
@@ -126,7 +106,7 @@ class Receptions:
         settled = self._settled.get(key)
         if settled is not None and now_s < settled.until_s:
             if chunk.ask:
-                self._owe(key, _Answer(now_s, now_s, chunk.ask))
+                self._answers.owe_now(key, chunk.ask, now_s)
             return []
         self._settled.pop(key, None)
         events: list[ReceptionEvent] = []
@@ -135,9 +115,10 @@ class Receptions:
             incoming.is_for_several |= to_all
             self._store(key, incoming, chunk, now_s, events)
         if key in self._settled:
-            self._owe(key, _Answer(now_s, now_s, max(chunk.ask, 1)))  # news: no need to be asked
+            self._answers.owe_now(key, max(chunk.ask, 1), now_s)  # news: no need to be asked
         else:
-            self._note_ask(key, chunk, now_s)
+            answered_at_s = -math.inf if incoming is None else incoming.answered_at_s
+            self._answers.note_ask(key, chunk, now_s, answered_at_s)
         return events
 
     def forget(self, peer: int, tag: int, at_s: float) -> None:
@@ -161,20 +142,14 @@ class Receptions:
 
     def answers(self, now_s: float) -> list[tuple[int, TransferStatus]]:
         """Return the (peer, status) that are due; what is returned counts as sent."""
-        out: list[tuple[int, TransferStatus]] = []
-        for key in [key for key, answer in self._answers.items() if answer.due_s <= now_s]:
-            budget = self._answer_budget(key[0])
-            budget.refill(now_s)
-            if not budget.allows_one():
-                continue
-            answer = self._answers.pop(key)
-            self._n_owed[key[0]] -= 1
-            for status in self._statuses(key, answer.ask):
-                budget.spend(len(encode_payload(status)[1]))
-                out.append((key[0], status))
+
+        def answered(key: Key, ask: int) -> list[TransferStatus]:
+            statuses = self._statuses(key, ask)
             if key in self._incoming:
                 self._incoming[key].answered_at_s = now_s
-        return out
+            return statuses
+
+        return self._answers.take_due(now_s, answered)
 
     def expire(self, now_s: float) -> list[ReceptionEvent]:
         """Drop unfinished blobs that nobody goes on with."""
@@ -191,20 +166,16 @@ class Receptions:
 
     def next_s(self) -> float:
         """Return when an answer is due or a blob expires; infinity for never."""
-        due = [
-            max(answer.due_s, self._answer_budget(peer).ready_at_s())
-            for (peer, _), answer in self._answers.items()
-        ]
-        return min(due + [self._expires_at_s(key) for key in self._incoming], default=math.inf)
+        return min([self._answers.next_s(), *map(self._expires_at_s, self._incoming)])
 
-    def _expires_at_s(self, key: _Key) -> float:
+    def _expires_at_s(self, key: Key) -> float:
         """Return when an unfinished blob is dropped if nothing comes of it until then."""
         keep_s = self._options.keep_partial_s
         if self._is_superseded(key):
             keep_s = min(keep_s, _SUPERSEDED_INTERVALS * self._options.pace.status_interval_s)
         return self._incoming[key].heard_at_s + keep_s
 
-    def _is_superseded(self, key: _Key) -> bool:
+    def _is_superseded(self, key: Key) -> bool:
         """Whether the sender has begun another blob of which it has one at a time for us.
 
         It may be that this one is the newer, of which a late chunk has come after the
@@ -214,20 +185,12 @@ class Receptions:
         kind = None if descriptor is None else _ONE_AT_A_TIME.get(descriptor.kind)
         return kind is not None and self._newest.get((key[0], kind)) != key[1]
 
-    def _answer_budget(self, peer: int) -> ByteBudget:
-        """Return what may be spent on answers to a peer."""
-        if peer not in self._answer_budgets:
-            rate = _ANSWERS_SHARE * self._options.pace.rate_bytes_per_s
-            burst_bytes = _MAX_STATUSES * MAX_FRAME_BYTES
-            self._answer_budgets[peer] = ByteBudget(rate, burst_bytes)
-        return self._answer_budgets[peer]
-
-    def _is_begun(self, key: _Key) -> bool:
+    def _is_begun(self, key: Key) -> bool:
         """Whether an unfinished blob is meant for us, and which chunks it has."""
         incoming = self._incoming.get(key)
         return incoming is not None and incoming.descriptor is not None
 
-    def _open(self, key: _Key, now_s: float, events: list[ReceptionEvent]) -> Incoming | None:
+    def _open(self, key: Key, now_s: float, events: list[ReceptionEvent]) -> Incoming | None:
         """Return the unfinished blob of a chunk, a new one if need be; None if too many are."""
         incoming = self._incoming.get(key)
         if incoming is not None:
@@ -245,7 +208,7 @@ class Receptions:
 
     def _store(
         self,
-        key: _Key,
+        key: Key,
         incoming: Incoming,
         chunk: Chunk,
         now_s: float,
@@ -291,7 +254,7 @@ class Receptions:
 
     def _finish(
         self,
-        key: _Key,
+        key: Key,
         incoming: Incoming,
         descriptor: Descriptor,
         now_s: float,
@@ -308,7 +271,7 @@ class Receptions:
         if incoming.n_damaged >= _MAX_DAMAGED:
             events.append(self._refuse(key, Reply.CORRUPT, "damaged every time", now_s))
 
-    def _fits(self, key: _Key, more_bytes: int, now_s: float, events: list[ReceptionEvent]) -> bool:
+    def _fits(self, key: Key, more_bytes: int, now_s: float, events: list[ReceptionEvent]) -> bool:
         """Return whether the quotas grant a blob more, if need be by dropping idle ones."""
         if more_bytes <= 0:
             return True
@@ -326,11 +289,11 @@ class Receptions:
             if not self._evict(evictable, now_s, events):
                 return False
 
-    def _cost_bytes(self, keys: list[_Key]) -> int:
+    def _cost_bytes(self, keys: list[Key]) -> int:
         """Return the memory that some unfinished blobs take."""
         return sum(self._incoming[key].cost_bytes for key in keys)
 
-    def _evict(self, keys: list[_Key], now_s: float, events: list[ReceptionEvent]) -> bool:
+    def _evict(self, keys: list[Key], now_s: float, events: list[ReceptionEvent]) -> bool:
         """Drop the one of these unfinished blobs that is idle longest, if it is idle at all."""
         if not keys:
             return False
@@ -340,18 +303,18 @@ class Receptions:
         events.append(self._abandon(idlest, "idle, and its memory was needed"))
         return True
 
-    def _abandon(self, key: _Key, reason: str) -> ReceptionAbandoned:
+    def _abandon(self, key: Key, reason: str) -> ReceptionAbandoned:
         """Drop an unfinished blob."""
         descriptor = self._incoming.pop(key).descriptor
         return ReceptionAbandoned(key[0], descriptor.kind if descriptor else None, reason)
 
-    def _refuse(self, key: _Key, reply: Reply, reason: str, now_s: float) -> ReceptionAbandoned:
+    def _refuse(self, key: Key, reply: Reply, reason: str, now_s: float) -> ReceptionAbandoned:
         """Drop an unfinished blob and tell its sender not to go on."""
         event = self._abandon(key, reason)
         self._settle(key, _Settled(reply, b"", now_s + self._options.keep_partial_s))
         return event
 
-    def _settle(self, key: _Key, settled: _Settled) -> None:
+    def _settle(self, key: Key, settled: _Settled) -> None:
         """Remember how a transfer ended; of too many forget the oldest, first the peer's own."""
         self._incoming.pop(key, None)
         self._settled[key] = settled
@@ -361,37 +324,7 @@ class Receptions:
         while len(self._settled) > _MAX_SETTLED:
             del self._settled[next(iter(self._settled))]
 
-    def _note_ask(self, key: _Key, chunk: Chunk, now_s: float) -> None:
-        """Owe an answer if the chunk asks, and put it off while chunks still come in.
-
-        Chunks overtake each other: an answer given at once would call those
-        lost that are still on their way. Only a sender that begins (nothing is
-        on its way yet) learns at once what is here already.
-        """
-        owed = self._answers.get(key)
-        if owed is None and not chunk.ask:
-            return
-        interval_s = self._options.pace.status_interval_s
-        asked_at_s = now_s if owed is None else owed.asked_at_s
-        due_s = min(asked_at_s + interval_s, now_s + _QUIET_SHARE * interval_s)
-        incoming = self._incoming.get(key)
-        answered_at_s = -math.inf if incoming is None else incoming.answered_at_s
-        if chunk.ask and chunk.index == 0 and now_s - answered_at_s >= interval_s:
-            due_s = now_s
-        elif owed is not None and owed.due_s <= now_s:
-            due_s = owed.due_s
-        self._owe(key, _Answer(due_s, asked_at_s, chunk.ask or (owed.ask if owed else 1)))
-
-    def _owe(self, key: _Key, answer: _Answer) -> None:
-        """Note an answer; beyond a bound it is left out, and the sender asks again."""
-        if key not in self._answers:
-            peer = key[0]
-            if self._n_owed[peer] >= _MAX_ANSWERS:
-                return
-            self._n_owed[peer] += 1
-        self._answers[key] = answer
-
-    def _statuses(self, key: _Key, ask: int) -> list[TransferStatus]:
+    def _statuses(self, key: Key, ask: int) -> list[TransferStatus]:
         """Return what there is to say about a transfer."""
         tag = key[1]
         settled = self._settled.get(key)
@@ -403,7 +336,7 @@ class Receptions:
         if incoming.is_for_several and incoming.descriptor is not None:
             return list(lacking_statuses(tag, ask, incoming.lacking_counts()))
         statuses = receiving_statuses(tag, ask, incoming.known_end(), incoming.missing())
-        return list(itertools.islice(statuses, _MAX_STATUSES))
+        return list(itertools.islice(statuses, MAX_STATUSES))
 
 
 def _descriptor_of(chunk: Chunk) -> Descriptor | None:

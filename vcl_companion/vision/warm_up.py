@@ -28,16 +28,9 @@ from vcl_companion.vision.features import Features
 from vcl_companion.vision.guided_pairs import match_epipolar
 from vcl_companion.vision.hamming import hamming_index, nearest_two
 from vcl_companion.vision.joint_kernels import joined, seen_aside, without_points
-from vcl_companion.vision.patches import (
-    AlignRules,
-    Anchors,
-    ChoiceRules,
-    align_patches,
-    choose_anchors,
-    keyframe_images,
-    lens_of,
-    pyramid_of,
-)
+from vcl_companion.vision.patch_choice import ChoiceRules, choose_anchors
+from vcl_companion.vision.patch_tables import Anchors, keyframe_images, lens_of, pyramid_of
+from vcl_companion.vision.patches import AlignRules, align_patches
 from vcl_companion.vision.relative_pose import essential_candidates
 from vcl_companion.vision.schur import carried
 from vcl_companion.vision.surface_kernels import inclinations
