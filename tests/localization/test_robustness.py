@@ -158,7 +158,10 @@ def displaced(
     poses = images.worlds_from_cams
     astray = tuple(Pose(pose.rotation, pose.translation + by_m) for pose in poses)
     twice = KeyframeImages(
-        images.texels, np.concatenate([images.shelves, images.shelves]), poses + astray
+        images.texels,
+        np.concatenate([images.shelves, images.shelves]),
+        np.concatenate([images.noises, images.noises]),
+        poses + astray,
     )
     points = np.where(wrong[:, None], anchors.points_world + by_m, anchors.points_world)
     keyframe = anchors.keyframe + len(poses) * wrong

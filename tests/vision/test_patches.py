@@ -61,6 +61,7 @@ def aligned(
     radius_px: float = 0.0,
     level: int = 0,
     camera: Camera = PINHOLE,
+    rules: AlignRules = AlignRules(),  # noqa: B008
 ) -> Alignment:
     rows = np.arange(len(anchors.landmark))
     radii = np.full(len(rows), radius_px)
@@ -72,7 +73,7 @@ def aligned(
         cam_from_world,
         radii,
         level,
-        AlignRules(),
+        rules,
     )
 
 
@@ -238,6 +239,27 @@ def test_the_choice_is_spread_and_takes_the_surest() -> None:
     # 0.01 rad and 0.01 m at 10 m: 3.2 px and more towards the corners, three sigma of both axes.
     assert (radii > 9.0).all()
     assert (radii < 40.0).all()
+
+
+def test_noise_may_be_forgiven_and_what_is_unlike_is_not() -> None:
+    """At dusk a patch varies by 6 to 10 grey levels, and by 6 of noise."""
+    rng = np.random.default_rng(12)
+    at = rng.uniform(60.0, [580.0, 420.0], (300, 2))
+
+    def at_dusk(image: Image) -> Image:
+        grey = 0.25 * image + rng.normal(0.0, 6.0, image.shape)
+        return np.asarray(np.clip(np.rint(grey), 0, 255), dtype=np.uint8)
+
+    bright, other = painted(rng), painted(rng)
+    anchors = anchored(at_dusk(bright), at)
+    for forgives_noise, least, most in ((False, 0.0, 0.35), (True, 0.6, 1.0)):
+        rules = AlignRules(forgives_noise=forgives_noise)
+        found = aligned(anchors, at_dusk(bright), Pose.identity(), rules=rules)
+        assert least <= found.found.mean() <= most
+        aside = np.linalg.norm(found.pixels[found.found] - at[found.found], axis=1)
+        assert np.median(aside) < 1.2
+        unlike = aligned(anchors, at_dusk(other), Pose.identity(), rules=rules)
+        assert unlike.found.mean() < 0.1
 
 
 def test_a_pyramid_keeps_places() -> None:

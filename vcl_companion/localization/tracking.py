@@ -273,6 +273,7 @@ class _Tracker:
                 misplaced_px_per_rad=float(np.rad2deg(options.misplaced_px_per_deg)),
                 misplaced_px_per_octave=options.misplaced_px_per_octave,
                 misplaced_by_residual=options.misplaced_by_residual,
+                forgives_noise=True,
             ),
         )
         return found.of(found.found)

@@ -118,8 +118,8 @@ class PatchTable:
         self._pyramids = pyramids
         usable = [p for p in pyramids if p is not None]
         n_levels = min((len(p.shelves) for p in usable), default=1)
-        empty = Pyramid(np.zeros(1, np.uint8), np.array([[0, 1, 1]] * n_levels, dtype=np.int64))
-        self._texels, self._shelves = laid_out([p or empty for p in pyramids])
+        empty = Pyramid(np.zeros(1, np.uint8), np.array([[0, 1, 1]] * n_levels, np.int64), 0.0)
+        self._laid_out = laid_out([p or empty for p in pyramids])
 
     @property
     def n_views(self) -> int:
@@ -210,6 +210,6 @@ class PatchTable:
             own=np.zeros((n, 3)),
             spread=np.zeros((n, 6)),
             texture=np.zeros((n, 3)),
-            images=KeyframeImages(self._texels, self._shelves, tuple(worlds_from_cams)),
+            images=KeyframeImages(*self._laid_out, tuple(worlds_from_cams)),
         )
         return anchors, fit

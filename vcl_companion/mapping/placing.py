@@ -36,11 +36,22 @@ class _Look:
 
 
 _NEAR = (
-    _Look(AlignRules(max_iterations=15, least_score=0.75, max_moved_px=3.0)),
-    _Look(AlignRules(max_iterations=15, least_score=0.8, max_moved_px=1.5, settled_px=0.02)),
+    _Look(AlignRules(max_iterations=15, least_score=0.75, max_moved_px=3.0, forgives_noise=True)),
+    _Look(
+        AlignRules(
+            max_iterations=15,
+            least_score=0.8,
+            max_moved_px=1.5,
+            settled_px=0.02,
+            forgives_noise=True,
+        )
+    ),
 )
 # A guess by features may be so far off; what is found at a quarter of the resolution leads on.
-_FAR = (_Look(AlignRules(max_iterations=15, least_score=0.7), 1.0, 24.0, 2), *_NEAR)
+_FAR = (
+    _Look(AlignRules(max_iterations=15, least_score=0.7, forgives_noise=True), 1.0, 24.0, 2),
+    *_NEAR,
+)
 
 
 @dataclass(frozen=True, eq=False)

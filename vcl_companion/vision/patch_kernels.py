@@ -6,6 +6,9 @@ A patch lies row by row in ``_WIDE`` columns, its own and two more: of the margi
 So does what is looked at of the frame; all loops run over whole rows of both, in single precision,
 and the compiler takes many texels at once.
 
+In the dark most of what differs between two images is noise, and a patch is none the less the
+same: a score may be the correlation of what both would show without it.
+
 Layout of the tables:
   texels (uint8), shelves (V, L, 3) int64: start, height, width of each pyramid level
 """
@@ -38,6 +41,8 @@ _LEAST_GRADIENT = 0.25
 # Where a patch's far side is so many times farther than its middle, it is edge on.
 _LEAST_DIVISOR = 0.5
 _LEAST_SHARE = 0.125
+# Of what varies in a patch so much is no noise, whatever the images as a whole say.
+_LEAST_SIGNAL = 0.6
 # Rounding in single precision stays within an image.
 _ROUNDING_PX = 1e-3
 # Why a patch was not found.
@@ -257,8 +262,10 @@ def align(
     key_pixels: Array,
     key_texels: Texels,
     shelves: Ints,
+    key_noises: Array,
     image: Texels,
     levels: Ints,
+    frame_noise: float,
     radii: Array,
     rules: Array,
     least_level: int,
@@ -276,13 +283,16 @@ def align(
         key_pixels: (M, 2) at which pixel there.
         key_texels: of all keyframes.
         shelves: (V, L, 3) of all keyframes.
+        key_noises: (V,) of their pixels, 1 sigma, grey levels.
         image: texels of the frame's pyramid.
         levels: (L, 3) shelves of the frame's pyramid.
+        frame_noise: of its pixels, 1 sigma, grey levels.
         radii: (M,) how far around the prediction to search first, px of the full image;
             below one pixel of the level there is no search.
-        rules: (8,) iterations; least score; how far an alignment may move from
+        rules: (9,) iterations; least score; how far an alignment may move from
             where it began, level px; px that count as settled; misplacement: base,
-            per rad, per octave, px, and as a factor on what the residual says.
+            per rad, per octave, px, and as a factor on what the residual says; 1 where the
+            score leaves out noise, else 0.
         least_level: pyramid level to align on; coarser for landmarks that would
             have to be magnified.
 
@@ -325,6 +335,12 @@ def align(
         u0, v0 = view[3] / size, view[4] / size
         _based(patch, basis, normal)
         energy = normal[0, 0]
+        # At half the size the variance of white noise is about a sixteenth.
+        forgiven = rules[8] * SIDE * SIDE
+        fewer = max(back[0] * back[3] - back[1] * back[2], 1.0)
+        noise = forgiven * _SMOOTHED * (key_noises[keyframe[i]] / fewer) ** 2
+        energy = max(energy - noise, _LEAST_SIGNAL * energy)
+        noise = forgiven * (frame_noise / (size * size)) ** 2
         if not _inverted(normal, inverse):
             status[i] = FLAT
             continue
@@ -332,7 +348,7 @@ def align(
         reach_px = radii[i] / size
         if reach_px >= 1.0:
             u, v, peak = _searched(
-                image, start, height, width, u0, v0, math.ceil(reach_px), basis[0], energy
+                image, start, height, width, u0, v0, math.ceil(reach_px), basis[0], energy, noise
             )
             if peak < 0.5 * rules[1]:
                 status[i] = UNLIKE
@@ -358,7 +374,8 @@ def align(
             gain = inverse[0, 0] * st + inverse[0, 1] * sx + inverse[0, 2] * sy
             ex = inverse[1, 0] * st + inverse[1, 1] * sx + inverse[1, 2] * sy
             ey = inverse[2, 0] * st + inverse[2, 1] * sx + inverse[2, 2] * sy
-            score = st / math.sqrt(max(spread * energy, 1e-9))
+            signal = max(spread - noise * smoothed, _LEAST_SIGNAL * spread)
+            score = min(st / math.sqrt(max(signal * energy, 1e-9)), 1.0)
             if not gain > 0.05:
                 status[i] = UNLIKE
                 break
@@ -411,9 +428,12 @@ def _searched(
     radius: int,
     template: Singles,
     energy: float,
+    noise: float,
 ) -> tuple[float, float, float]:
     """Return the pixel near (u0, v0) that correlates best with a zero-mean patch, and its score.
 
+    The score is of what both would show without noise: ``energy`` of the patch is, and of what
+    it is compared with ``noise`` is taken.
     Whole steps around the prediction, so that a right one is not moved. Every step through the
     window is a number of the same line: those at the ends of its rows, where a patch would go on
     in the next one, are counted and not looked at.
@@ -445,7 +465,7 @@ def _searched(
                 s2 += grey * grey
                 st += grey * weights[c]
             sums[k], squares[k], products[k] = s, s2, st
-    best, best_u, best_v = -2.0, u0, v0
+    best, best_u, best_v, most = -2.0, u0, v0, 0.0
     for i in range(bottom - top + 1):
         for j in range(right - left + 1):
             k = i * wide + j
@@ -454,7 +474,8 @@ def _searched(
             score = float(products[k]) / math.sqrt(max(spread * energy, 1e-9))
             if score > best:
                 best, best_u, best_v = score, float(left + j), float(top + i)
-    return best_u, best_v, best
+                most = spread
+    return best_u, best_v, best * math.sqrt(most / max(most - noise, _LEAST_SIGNAL * most, 1e-9))
 
 
 @compiled

@@ -21,6 +21,7 @@ from vcl_companion.geometry.pose import Pose
 from vcl_companion.geometry.rotation import Array
 from vcl_companion.vision import patch_views
 from vcl_companion.vision.features import Image
+from vcl_companion.vision.image_noise import grey_noise
 
 Ints = NDArray[np.int64]
 
@@ -36,10 +37,12 @@ class Pyramid:
     Attributes:
         texels: (T,) grey levels of all levels, row by row.
         shelves: (L, 3) where each level begins, its height and width.
+        noise: of the image's pixels, 1 sigma, grey levels.
     """
 
     texels: NDArray[np.uint8]
     shelves: Ints
+    noise: float
 
     @property
     def image(self) -> Image:
@@ -63,7 +66,7 @@ def pyramid_of(image: Image, n_levels: int = _N_LEVELS) -> Pyramid:
     levels[0][:] = image
     for larger, smaller in pairwise(levels):
         cv2.pyrDown(larger, smaller)
-    return Pyramid(texels, np.array(shelves, dtype=np.int64))
+    return Pyramid(texels, np.array(shelves, dtype=np.int64), grey_noise(image))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,12 +152,13 @@ class KeyframeImages:
     """The keyframes of a map as one table.
 
     Attributes:
-        texels, shelves: of all pyramids, (T,) and (V, L, 3).
+        texels, shelves, noises: of all pyramids, (T,), (V, L, 3) and (V,).
         worlds_from_cams: V poses.
     """
 
     texels: NDArray[np.uint8]
     shelves: Ints
+    noises: Array
     worlds_from_cams: tuple[Pose, ...]
 
     @cached_property
@@ -174,17 +178,18 @@ class KeyframeImages:
         return out
 
 
-def laid_out(pyramids: list[Pyramid]) -> tuple[NDArray[np.uint8], Ints]:
-    """Return the texels of V images in one array, and (V, L, 3) where each level lies in it.
+def laid_out(pyramids: list[Pyramid]) -> tuple[NDArray[np.uint8], Ints, Array]:
+    """Return V images as one table: their texels, where each level lies in them, their noise.
 
-    All get as many levels as the smallest has; see ``Pyramid``.
+    (T,), (V, L, 3) and (V,). All get as many levels as the smallest has; see ``Pyramid``.
     """
     n_levels = min(len(p.shelves) for p in pyramids)
     starts = np.concatenate([[0], np.cumsum([len(p.texels) for p in pyramids])[:-1]])
     shelves = np.stack(
         [p.shelves[:n_levels] + np.array([s, 0, 0]) for p, s in zip(pyramids, starts, strict=True)]
     )
-    return np.concatenate([p.texels for p in pyramids]), shelves.astype(np.int64)
+    noises = np.array([p.noise for p in pyramids], dtype=np.float64)
+    return np.concatenate([p.texels for p in pyramids]), shelves.astype(np.int64), noises
 
 
 def keyframe_images(pyramids: list[Pyramid], worlds_from_cams: list[Pose]) -> KeyframeImages:

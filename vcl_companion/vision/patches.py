@@ -27,6 +27,8 @@ class AlignRules:
         misplaced_px_per_rad: per angle between the lines of sight.
         misplaced_px_per_octave: per doubling or halving of the distance.
         misplaced_by_residual: per sigma that the residual of the grey levels explains.
+        forgives_noise: whether the correlation is of what both images would show without noise.
+            So a frame in the dark is found by the map; what makes a map has to be like itself.
     """
 
     max_iterations: int = 10
@@ -37,6 +39,7 @@ class AlignRules:
     misplaced_px_per_rad: float = 0.5
     misplaced_px_per_octave: float = 0.03
     misplaced_by_residual: float = 0.7
+    forgives_noise: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +121,10 @@ def align_patches(
         anchors.pixels.take(chosen, axis=0),
         images.texels,
         images.shelves,
+        images.noises,
         frame.texels,
         frame.shelves,
+        frame.noise,
         radii_px,
         np.array(
             [
@@ -131,6 +136,7 @@ def align_patches(
                 rules.misplaced_px_per_rad,
                 rules.misplaced_px_per_octave,
                 rules.misplaced_by_residual,
+                rules.forgives_noise,
             ],
             dtype=np.float64,
         ),
