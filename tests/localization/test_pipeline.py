@@ -98,18 +98,16 @@ def test_what_hardly_any_of_the_landmarks_tried_agree_on_is_no_pose(
     rng = np.random.default_rng(5)
     something_else = rng.integers(0, 256, shot.image.shape, dtype=np.uint8)
     is_shown = np.kron(rng.random((6, 8)) < share, np.ones((40, 40), dtype=np.bool_))
-    # Fewer than are in view, so that as many are tried as may be.
-    options = replace(OPTIONS, tracking=replace(OPTIONS.tracking, n_landmarks=300))
     fix = localize(
         np.where(is_shown, shot.image, something_else), sensor.camera, sensor.body_from_cam,
         demo.map_index(1, 2, 3), demo.templates(1, 2, 3), prior(), shot.ned_from_body.rotation,
-        options, Effort(may_search=False),
+        OPTIONS, Effort(may_search=False),
     )  # fmt: skip
     if enough:
         found(fix, "patches")
     else:
         assert isinstance(fix, NotLocalized)
-        assert re.fullmatch(r"only \d\d of 300 landmarks tried agree on a pose", fix.reason)
+        assert re.fullmatch(r"only \d\d of 400 landmarks tried agree on a pose", fix.reason)
 
 
 def test_what_one_detector_does_not_recognise_another_may() -> None:
