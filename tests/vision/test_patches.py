@@ -21,6 +21,7 @@ from vcl_companion.vision.patch_views import bent, seen_from
 from vcl_companion.vision.patches import Alignment, AlignRules, align_patches
 
 RULES = ChoiceRules(40.0, 4.0, 0.05, 0.5, 0.03, 1.5, 3.5)
+STRICT = AlignRules()
 
 
 def painted(rng: np.random.Generator, height: int = 480, width: int = 640) -> Image:
@@ -61,7 +62,7 @@ def aligned(
     radius_px: float = 0.0,
     level: int = 0,
     camera: Camera = PINHOLE,
-    rules: AlignRules = AlignRules(),  # noqa: B008
+    rules: AlignRules = STRICT,
 ) -> Alignment:
     rows = np.arange(len(anchors.landmark))
     radii = np.full(len(rows), radius_px)
