@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import re
 import threading
 import weakref
 from collections import Counter
@@ -294,6 +295,60 @@ def test_a_frame_whose_image_cannot_be_decoded_is_refused_and_logged(tmp_path: P
             ]
             # It was no frame that the camera's driver dropped.
             assert up.log.frames == {"localized": 2, "refused": 1, "dropped": 0}
+
+    run(scenario())
+
+
+def test_a_camera_that_has_frozen_does_not_hold_the_drone_back(tmp_path: Path) -> None:
+    """The image that it gives again is found on the map as surely as when it was taken."""
+
+    async def scenario() -> None:
+        async with flying(tmp_path) as up:
+            up.fly_on_a_map()
+            for k in range(11):
+                if k in (7, 8, 9):
+                    up.give_image(k, demo.png(demo.shot(DRONE, 6).image))
+                else:
+                    up.give(k)
+                await up.server.answered()
+            why = "the camera gives the same image again"
+            assert up.frames() == [
+                *((k, "localized", None) for k in range(7)),
+                *((k, "refused", why) for k in (7, 8, 9)),
+                (10, "localized", None),
+            ]
+            told_us = [(await up.autopilot.poses.get())[0] for _ in range(8)]
+            assert told_us == [demo.shot(DRONE, k).at_ns // 1000 for k in (*range(7), 10)]
+            assert not any(up.history.has(demo.shot(DRONE, k).at_ns) for k in (7, 8, 9))
+
+    run(scenario())
+
+
+def test_an_image_of_another_place_is_not_believed_nor_are_peers_asked(tmp_path: Path) -> None:
+    """As where the rest of a torn transfer is of before; here it is the neighbour's."""
+
+    async def scenario() -> None:
+        async with flying(tmp_path, peers=(1, 3)) as up:
+            up.fly_on_a_map()
+            for k in range(10):
+                if k == 7:
+                    there = demo.shot(3, k)
+                    up.autopilot.measure(there.at_ns, there.ned_from_body.quaternion())
+                    up.server.give(k, there.at_ns, demo.png(there.image))
+                else:
+                    up.give(k)
+                await up.server.answered()
+            assert [k for k, outcome, _ in up.frames() if outcome != "localized"] == [7]
+            assert re.fullmatch(
+                r"\d\.\d m from where it was expected, by one frame alone", str(up.frames()[7][2])
+            )
+            assert up.asked == []
+            assert up.estimator.n_resets == 0
+            for k in (0, 1, 2, 3, 4, 5, 6, 8, 9):
+                usec, *sent = await up.autopilot.poses.get()
+                assert usec == demo.shot(DRONE, k).at_ns // 1000
+                off_m = np.array(sent[:3]) - demo.world_from_body(DRONE, k).translation
+                assert np.linalg.norm(off_m) < 0.15
 
     run(scenario())
 

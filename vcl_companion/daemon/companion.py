@@ -12,7 +12,9 @@ from vcl_companion.daemon.estimator import Estimator
 from vcl_companion.daemon.flight_log import Basis, PoseSource
 from vcl_companion.daemon.frame_outcomes import FrameOutcomes
 from vcl_companion.daemon.frame_waits import FrameWaits
+from vcl_companion.daemon.frozen_camera import FrozenCamera
 from vcl_companion.daemon.health import Health
+from vcl_companion.daemon.jump_witness import Unwitnessed
 from vcl_companion.daemon.mailbox import FramesBehind, Mailbox
 from vcl_companion.daemon.map_search import MapSearch, Sought
 from vcl_companion.daemon.map_store import MapStore, StoredMap
@@ -30,6 +32,7 @@ _log = logging.getLogger(__name__)
 _LAST_FRAMES_S = 5.0
 # A third of a megabyte each.
 _MAX_BEHIND = 16
+_FROZEN = "the camera gives the same image again"
 
 
 class Companion:
@@ -80,6 +83,7 @@ class Companion:
         self._estimator = estimator
         self._on_frame = on_frame
         self._health = health
+        self._frozen = FrozenCamera(own_fixes.attitude_at, estimator.predicted)
         self._mailbox = Mailbox()
         self._waits = FrameWaits(self._mailbox, maps, health, frame_wait_s)
         self._map_search = MapSearch(self._mailbox, maps, estimator, work)
@@ -89,10 +93,15 @@ class Companion:
         """Move frames from the camera to the mailbox until the stream ends and all are answered.
 
         A frame that still waits for a first map then is answered at once, one
-        that is being localized when that is done.
+        that is being localized when that is done. One that is the last one again is none.
         """
         async for frame in self._camera.frames():
             self._outcomes.opened(frame)
+            if await self._frozen.has_given(frame):
+                at_ns = frame.captured_at_ns
+                self._own_fixes.take_nothing(frame, await self._own_fixes.attitude_at(at_ns))
+                self._give_up(frame, NotLocalized(_FROZEN))
+                continue
             self._teller.arrived(frame.captured_at_ns)
             replaced = self._mailbox.put(frame)
             if replaced is not None:
@@ -204,8 +213,12 @@ class Companion:
     ) -> Sought | AskedPeers | None:
         """Answer a frame that has been looked at, unless peers are asked about it.
 
-        Nor are they while the search of an older frame, which will lead this one, has only begun.
+        Nor are they while the search of an older frame, which will lead this one, has only begun,
+        or where they would see what the frame's own fix was refused for.
         """
+        if isinstance(refused, Unwitnessed):
+            self._give_up(frame, refused)
+            return None
         now_s = asyncio.get_running_loop().time()
         is_sought = self._estimator.in_sight.is_being_sought(now_s)
         is_led = refused is not None and self._map_search.is_behind(frame) and is_sought

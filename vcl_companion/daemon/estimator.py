@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from vcl_companion.daemon.jump_witness import JumpWitness
 from vcl_companion.daemon.last_own_fix import FRESH_NS, LastOwnFix
 from vcl_companion.daemon.local_frame import LocalFrame
 from vcl_companion.daemon.map_in_sight import MapInSight
@@ -74,6 +75,7 @@ class Estimator:
         self._jumped = jumped
         self._history = PoseHistory(HISTORY_S, options, LOST_S)
         self._n_contradicted = 0
+        self._witness = JumpWitness(options)
         self._has_begun = False
         self.n_resets = 0
         """How often the pose has jumped."""
@@ -173,6 +175,7 @@ class Estimator:
         self.n_forgotten += 1
         self._history.clear()
         self._n_contradicted = 0
+        self._witness.forget()
         self.last_own_fix.forget()
         self.in_sight.forget_shown()
 
@@ -279,7 +282,12 @@ class Estimator:
             updated = update(predicted, fix)
             if isinstance(updated, FilterState):
                 if updated.n_jumps > predicted.n_jumps:
+                    witnessed = self._witness.heard(predicted, updated, fix, ned_from_body)
+                    if isinstance(witnessed, NotLocalized):
+                        self.take_nothing(predicted, at_ns, ned_from_body)
+                        return witnessed
                     self._relocalized(fix)
+                    updated = witnessed
                 state = updated
             elif not self._begins_anew(fix):
                 self.take_nothing(predicted, at_ns, ned_from_body)
@@ -290,6 +298,7 @@ class Estimator:
             self._relocalized(fix)
         self._n_contradicted = 0
         self._has_begun = True
+        self._witness.forget()
         self._history.append(state, fix, ned_from_body)
         self.last_own_fix.note(state)
         self.in_sight.note(at_ns, fix if fix.is_on_map else None)
@@ -297,6 +306,9 @@ class Estimator:
 
     def _take_late(self, fix: Localized, at_ns: int) -> FilterState | NotLocalized:
         before = self._history.at(at_ns)
+        unwitnessed = before and self._witness.heard_late(before, fix)
+        if unwitnessed:
+            return unwitnessed
         state = self._history.refit(at_ns, fix)
         if before is None or state is None:
             return NotLocalized("found after a later frame had been")
@@ -372,6 +384,7 @@ class Estimator:
         """
         newest = self._history.newest
         self._history.clear()
+        self._witness.forget()
         if newest is not None:
             there = carried(newest, other_from_world)
             self._history.append(there, None, newest.ned_from_body)

@@ -108,7 +108,7 @@ class OwnFixes:
         """
         while True:
             n_forgotten = self._estimator.n_forgotten
-            ned_from_body = await self._attitude_of(frame)
+            ned_from_body = await self.attitude_at(frame.captured_at_ns)
             now_s = asyncio.get_running_loop().time()
             may_doubt = now_s >= self._doubted_at_s + _DOUBT_EVERY_S
             effort = Effort(may_search=stored.templates is None, may_doubt=may_doubt)
@@ -172,15 +172,16 @@ class OwnFixes:
         stored = self._maps.current
         if stored is None or stored.templates is None:
             return None
-        ned_from_body = await self._attitude_of(frame)
+        ned_from_body = await self.attitude_at(frame.captured_at_ns)
         now_s, n_forgotten = asyncio.get_running_loop().time(), self._estimator.n_forgotten
         fix = await self._localized(frame, stored, ned_from_body, _PATCHES_ALONE, prior)
         if not self._still_counts(stored, n_forgotten):
             return None
         return Look(stored, ned_from_body, fix, now_s)
 
-    async def _attitude_of(self, frame: Frame) -> Array | None:
-        attitude = await self._autopilot.attitudes.at(frame.captured_at_ns, ATTITUDE_WAIT_S)
+    async def attitude_at(self, at_ns: int) -> Array | None:
+        """Return (3, 3) ned_from_body by the autopilot at the instant of a frame, or None."""
+        attitude = await self._autopilot.attitudes.at(at_ns, ATTITUDE_WAIT_S)
         return None if attitude is None else attitude.ned_from_body
 
     async def _localized(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,23 +35,13 @@ class _Look:
     level: int = 0
 
 
+_RULES = AlignRules(max_iterations=15, forgives_noise=True)
 _NEAR = (
-    _Look(AlignRules(max_iterations=15, least_score=0.75, max_moved_px=3.0, forgives_noise=True)),
-    _Look(
-        AlignRules(
-            max_iterations=15,
-            least_score=0.8,
-            max_moved_px=1.5,
-            settled_px=0.02,
-            forgives_noise=True,
-        )
-    ),
+    _Look(replace(_RULES, least_score=0.75, max_moved_px=3.0)),
+    _Look(replace(_RULES, least_score=0.8, max_moved_px=1.5, settled_px=0.02)),
 )
 # A guess by features may be so far off; what is found at a quarter of the resolution leads on.
-_FAR = (
-    _Look(AlignRules(max_iterations=15, least_score=0.7, forgives_noise=True), 1.0, 24.0, 2),
-    *_NEAR,
-)
+_FAR = (_Look(replace(_RULES, least_score=0.7), 1.0, 24.0, 2), *_NEAR)
 
 
 @dataclass(frozen=True, eq=False)

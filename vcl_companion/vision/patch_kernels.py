@@ -313,6 +313,7 @@ def align(
     across, down = np.empty(_N_MARGINED, np.float32), np.empty(_N_MARGINED, np.float32)
     back = np.empty(6)
     normal, inverse = np.empty((3, 3)), np.empty((3, 3))
+    forgiven = rules[8] * SIDE * SIDE
     for i in range(m):
         if not seen[i]:
             continue
@@ -336,10 +337,9 @@ def align(
         _based(patch, basis, normal)
         energy = normal[0, 0]
         # At half the size the variance of white noise is about a sixteenth.
-        forgiven = rules[8] * SIDE * SIDE
         fewer = max(back[0] * back[3] - back[1] * back[2], 1.0)
-        noise = forgiven * _SMOOTHED * (key_noises[keyframe[i]] / fewer) ** 2
-        energy = max(energy - noise, _LEAST_SIGNAL * energy)
+        key_noise = forgiven * _SMOOTHED * (key_noises[keyframe[i]] / fewer) ** 2
+        energy = max(energy - key_noise, _LEAST_SIGNAL * energy)
         noise = forgiven * (frame_noise / (size * size)) ** 2
         if not _inverted(normal, inverse):
             status[i] = FLAT
