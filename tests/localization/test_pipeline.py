@@ -136,6 +136,31 @@ def test_without_time_for_a_search_patches_are_followed_and_nothing_is_looked_fo
             assert fix == NotLocalized("lost, and not looked for again yet")
 
 
+@pytest.mark.parametrize("axis", [1, 2])
+def test_an_attitude_that_has_swung_farther_than_it_says_costs_no_search(axis: int) -> None:
+    """By six degrees of pitch or yaw, where it says a third of one."""
+    shot, sensor = demo.shot(DRONE, FRAME), demo.sensor(DRONE)
+    swung = exp_so3(np.deg2rad(6.0) * np.eye(3)[axis])
+    truth, sure = demo.world_from_body(DRONE, FRAME), np.diag(np.repeat([0.05, 0.005], 3) ** 2)
+    expected = Prior(Pose(truth.rotation @ swung, truth.translation), sure)
+    attitude, templates = shot.ned_from_body.rotation, demo.templates(1, 2, 3)
+    followed = follow(
+        shot.image, sensor.camera, sensor.body_from_cam, templates, expected, attitude, OPTIONS
+    )
+    assert isinstance(followed, NotLocalized)
+    fix = localize(
+        shot.image, sensor.camera, sensor.body_from_cam, demo.map_index(1, 2, 3), templates,
+        expected, attitude, OPTIONS, Effort(may_search=False),
+    )  # fmt: skip
+    found(fix, "patches")
+    nothing = np.random.default_rng(2).integers(0, 256, shot.image.shape, dtype=np.uint8)
+    refused = localize(
+        nothing, sensor.camera, sensor.body_from_cam, demo.map_index(1, 2, 3), templates,
+        expected, attitude, OPTIONS, Effort(may_search=False),
+    )  # fmt: skip
+    assert isinstance(refused, NotLocalized)
+
+
 @pytest.mark.parametrize("expected", [None, prior()], ids=["lost", "predicted"])
 def test_an_autopilot_without_a_north_contradicts_no_heading(expected: Prior | None) -> None:
     shot, sensor = demo.shot(DRONE, FRAME), demo.sensor(DRONE)
