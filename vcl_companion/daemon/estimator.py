@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vcl_companion.daemon.jump_witness import JumpWitness
+from vcl_companion.daemon.jump_witness import RECENTLY_NS, JumpWitness
 from vcl_companion.daemon.last_own_fix import FRESH_NS, LastOwnFix
 from vcl_companion.daemon.local_frame import LocalFrame
 from vcl_companion.daemon.map_in_sight import MapInSight
@@ -282,7 +282,9 @@ class Estimator:
             updated = update(predicted, fix)
             if isinstance(updated, FilterState):
                 if updated.n_jumps > predicted.n_jumps:
-                    witnessed = self._witness.heard(predicted, updated, fix, ned_from_body)
+                    witnessed = self._witness.heard(
+                        predicted, updated, fix, ned_from_body, self._recent(at_ns)
+                    )
                     if isinstance(witnessed, NotLocalized):
                         self.take_nothing(predicted, at_ns, ned_from_body)
                         return witnessed
@@ -306,7 +308,7 @@ class Estimator:
 
     def _take_late(self, fix: Localized, at_ns: int) -> FilterState | NotLocalized:
         before = self._history.at(at_ns)
-        unwitnessed = before and self._witness.heard_late(before, fix)
+        unwitnessed = before and self._witness.heard_late(before, fix, self._recent(at_ns))
         if unwitnessed:
             return unwitnessed
         state = self._history.refit(at_ns, fix)
@@ -328,6 +330,9 @@ class Estimator:
         self.in_sight.note_shown(at_ns, fix)
         self.last_own_fix.note(state)
         return state
+
+    def _recent(self, at_ns: int) -> list[FilterState]:
+        return self._history.between(at_ns - RECENTLY_NS, at_ns)
 
     def take_proposal(
         self,

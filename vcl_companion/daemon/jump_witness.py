@@ -1,21 +1,24 @@
-"""A jump that one frame alone speaks for: believed when a second one says the same.
+"""A fix that puts the drone back where it has just been, against all that it flew since.
 
-Half of an image can be of an earlier one, where a transfer was cut off, and a court of windows can
-look the same one window on. What such a frame says may be as sure as any other. A drone whose last
-fix is fresh need not believe it at once: by the next frame it is the place of both, or of none.
+The end of an image can be of the one before, where its transfer was cut off or its buffer written
+anew, and a stream may repeat an image with other noise. That part is found on the map where it was
+taken, as surely as any. Who braked as hard as that is there in the next frame as well: so it is
+believed when a second one says the same, and the autopilot is not reset for one image.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from vcl_companion.geometry.rotation import Array
-from vcl_companion.localization.filter_state import FilterState
+from vcl_companion.localization.filter_state import GATE_POSE, FilterState
 from vcl_companion.localization.fix import Localized, NotLocalized
 from vcl_companion.localization.pose_filter import FilterOptions, predict, update
 
-# Who has had no fix for longer has flown on as nobody knows, and jumps for that.
-_FRESH_NS = 1_000_000_000
+RECENTLY_NS = 1_000_000_000
+"""Images of before are not older."""
 
 
 class Unwitnessed(NotLocalized):
@@ -23,7 +26,7 @@ class Unwitnessed(NotLocalized):
 
 
 class JumpWitness:
-    """Holds back the first frame of a jump until the next one.
+    """Holds back the first frame of a jump to where the drone was, until the next one.
 
     Args:
         options: of the filter.
@@ -39,6 +42,7 @@ class JumpWitness:
         jumped: FilterState,
         fix: Localized,
         ned_from_body: Array | None,
+        recent: Sequence[FilterState],
     ) -> FilterState | Unwitnessed:
         """Return what is to be believed after the newest frame's fix that is a jump.
 
@@ -47,44 +51,54 @@ class JumpWitness:
             jumped: with it, where it says.
             fix: which.
             ned_from_body: (3, 3) attitude of its instant, or None.
+            recent: what was believed of the frames ``RECENTLY_NS`` before.
 
         Returns:
             The state after the jump, or that the next frame has to tell.
         """
         alleged, self._alleged = self._alleged, jumped
-        if not _is_fresh(predicted):
-            return jumped
         if alleged is not None:
             carried = predict(alleged, jumped.at_ns, ned_from_body, self._options)
             again = carried and update(carried, fix)
             if isinstance(again, FilterState) and again.n_jumps == alleged.n_jumps:
                 return again
-        return _unwitnessed(predicted, fix)
+        return _of_before(predicted, fix, recent) or jumped
 
-    def heard_late(self, before: FilterState, fix: Localized) -> Unwitnessed | None:
+    def heard_late(
+        self, before: FilterState, fix: Localized, recent: Sequence[FilterState]
+    ) -> Unwitnessed | None:
         """Return whether a fix is a jump that the frames which came since have not told of.
 
         Args:
             before: what was believed at the frame's instant.
             fix: of that frame, found after later ones had been.
+            recent: what was believed of the frames ``RECENTLY_NS`` before.
         """
-        if before.fixed_at_ns == before.at_ns or not _is_fresh(before):
+        if before.fixed_at_ns == before.at_ns:
             return None
         jumped = update(before, fix)
         if isinstance(jumped, NotLocalized) or jumped.n_jumps == before.n_jumps:
             return None
-        return _unwitnessed(before, fix)
+        return _of_before(before, fix, recent)
 
     def forget(self) -> None:
         """Forget what the last frame said: a later one has said otherwise, or all is new."""
         self._alleged = None
 
 
-def _is_fresh(state: FilterState) -> bool:
-    return state.at_ns - state.fixed_at_ns <= _FRESH_NS
-
-
-def _unwitnessed(expected: FilterState, fix: Localized) -> Unwitnessed:
-    away = expected.world_from_body.translation - fix.world_from_body.translation
-    reason = f"{np.linalg.norm(away):.1f} m from where it was expected, by one frame alone"
-    return Unwitnessed(reason, fix.n_matched, fix.n_inliers)
+def _of_before(
+    expected: FilterState, fix: Localized, recent: Sequence[FilterState]
+) -> Unwitnessed | None:
+    """Return that a fix is where a frame of before was, place and attitude; None if it is not."""
+    # Both err by this; what their map is off, alike.
+    noise = 2.0 * (fix.noise_covariance + fix.own_map_covariance)
+    for state in recent:
+        # Before its last jump it was elsewhere, or rather had not been there.
+        if state.fixed_at_ns != state.at_ns or state.n_jumps != expected.n_jumps:
+            continue
+        away = state.world_from_body.local(fix.world_from_body)
+        if away @ np.linalg.solve(noise, away) <= GATE_POSE:
+            back = expected.world_from_body.translation - fix.world_from_body.translation
+            reason = f"{np.linalg.norm(back):.1f} m back, where an earlier frame was"
+            return Unwitnessed(reason, fix.n_matched, fix.n_inliers)
+    return None

@@ -93,6 +93,10 @@ class PoseHistory:
         earlier = (step.state for step in reversed(self._steps) if step.state.at_ns <= at_ns)
         return next(earlier, None)
 
+    def between(self, from_ns: int, until_ns: int) -> list[FilterState]:
+        """Return the states after the frames from an instant on and before another one."""
+        return [s.state for s in self._steps if from_ns <= s.state.at_ns < until_ns]
+
     def own_fix_at(self, at_ns: int) -> FilterState | None:
         """Return the state after the frame of an instant, if the frame gave a fix on the map."""
         return None if self.fix_at(at_ns) is None else self.at(at_ns)
